@@ -1,0 +1,74 @@
+"""Capture: what cameras saw. Frame: one image with its camera and time.
+
+Plain data in normalised units. Knows nothing of file formats (the readers do) or of decoding
+(`graings.capture.images`), and nothing of what is learned from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graings.camera import Camera, View
+from graings.units import Units
+
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image. `camera` is that of the image as `ImageStore` returns it: undistorted and downscaled."""
+
+    name: str  # file name relative to the capture, unique within a split
+    camera: Camera
+    time: float  # normalised to [0, 1]
+    image_path: Path
+    source_size: tuple[int, int]  # width, height of the file in pixels
+
+    def view(self) -> View:
+        """The frame without its image."""
+        return View(self.name, self.camera, self.time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointCloud:
+    """Structure-from-motion points: positions [M, 3] in normalised units, colours [M, 3] in [0, 1]."""
+
+    positions: NDArray[np.float64]
+    colors: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capture:
+    """Images with known cameras and times, in three splits (only `train` must hold frames)."""
+
+    root: Path
+    kind: Literal["transforms", "colmap"]
+    train: tuple[Frame, ...]
+    val: tuple[Frame, ...]
+    test: tuple[Frame, ...]
+    units: Units
+    has_alpha: bool  # some image carries an alpha channel
+    points: PointCloud | None = None
+    notes: tuple[str, ...] = field(default=())  # what the reader left out or assumed, in words
+    content_hash: str = ""  # sha256 over the files that were read, independent of the folder's place
+
+    def split(self, name: Split) -> tuple[Frame, ...]:
+        """Frames of one split."""
+        return {"train": self.train, "val": self.val, "test": self.test}[name]
+
+    def __iter__(self) -> Iterator[tuple[Split, Frame]]:
+        for name in SPLITS:
+            for frame in self.split(name):
+                yield name, frame
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Distinct training times, ascending, [T]."""
+        return np.unique(np.array([frame.time for frame in self.train], dtype=np.float64))

@@ -1,0 +1,207 @@
+"""Every number a user may choose, with its bounds, defaults and one line of help.
+
+Pure data: no tensors, no files. Each part is read by one owner only (named in its docstring). Iteration
+marks are those of the paper's 30 000-iteration schedule and are scaled with `iterations`, so shortening a
+run keeps its shape. Knows nothing of how the numbers are used.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from graings.errors import ConfigError
+
+PAPER_ITERATIONS = 30_000
+
+
+class Part(BaseModel):
+    """Strict base of all parts: unknown fields and non-finite numbers are refused; values are frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class CaptureConfig(Part):
+    """How images are read. Owner: `graings.capture`."""
+
+    max_side: int | None = Field(
+        400, ge=16, le=16384, description="Longest image side in px; null keeps the files' size."
+    )
+    background: Literal["white", "black"] | tuple[float, float, float] = Field(
+        "white", description="Colour behind transparent pixels: white, black or [r, g, b] in [0, 1]."
+    )
+    times_from_names: bool = Field(False, description="COLMAP: take times from the number in the file name.")
+    test_every: int = Field(
+        8, ge=2, description="COLMAP: every n-th image by name is held out for test when there is no split."
+    )
+    cache_mb: int = Field(1024, ge=16, description="Memory for decoded images in MB.")
+
+    def background_rgb(self) -> tuple[float, float, float]:
+        """The background as RGB in [0, 1]."""
+        named = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+        return named[self.background] if isinstance(self.background, str) else self.background
+
+
+class SceneConfig(Part):
+    """Shape of the model and the paper's structural ablations. Owner: `graings.scene`."""
+
+    children: int = Field(10, ge=1, le=32, description="Child Gaussians per anchor (k).")
+    feature_dim: int = Field(32, ge=1, le=256, description="Length of the anchor feature (d_f).")
+    head_width: int = Field(32, ge=4, le=512, description="Hidden width of the colour, opacity and residual heads.")
+    static_width: int = Field(64, ge=4, le=512, description="Hidden width of StaticMLP.")
+    child_code_dim: int = Field(8, ge=0, le=64, description="Learned code per child slot, input of StaticMLP.")
+    deform_width: int = Field(64, ge=4, le=1024, description="Hidden width of DeformNet.")
+    deform_depth: int = Field(4, ge=1, le=12, description="Hidden layers of DeformNet.")
+    position_frequencies: int = Field(8, ge=0, le=16, description="Octaves of the position encoding in DeformNet.")
+    time_frequencies: int = Field(6, ge=0, le=16, description="Octaves of the time encoding (L).")
+    residual_scale: float = Field(0.1, ge=0, le=1, description="Bound of the appearance residual (eta).")
+    deformation: Literal["child", "anchor", "none"] = Field(
+        "child", description="child: an offset per Gaussian (the method); anchor: broadcast per anchor; none: static."
+    )
+    stop_gradient: bool = Field(True, description="Detach the canonical position before DeformNet (Eq. 6).")
+    single_mlp: bool = Field(False, description="Ablation: one network for canonical and temporal geometry.")
+    residual: bool = Field(True, description="Temporal appearance residual (Eq. 12).")
+    residual_stop_gradient: bool = Field(True, description="Detach the anchor feature before the residual field.")
+    canonical: bool = Field(True, description="Ablation when off: no canonical geometry branch and no warm-up.")
+    opacity_view: bool = Field(False, description="Feed the viewing direction to the opacity head.")
+    projected_clip: bool = Field(True, description="Let clipped values receive gradients that point back inside.")
+
+
+class InitConfig(Part):
+    """The first anchors. Owner: `graings.training.initialize`."""
+
+    points: int = Field(20_000, ge=16, le=2_000_000, description="Random points where the capture has no cloud.")
+    carve_vote: float = Field(0.6, ge=0, le=1, description="Share of views whose mask a random point must hit to stay.")
+    max_points: int = Field(60_000, ge=16, description="At most this many points of a given cloud are used.")
+    voxel_size: float | None = Field(
+        None, gt=0, description="Finest anchor cell, normalised; null: 0.7 pixel footprints."
+    )
+    offset_std: float = Field(0.3, ge=0, le=10, description="Spread of the first child offsets in units of s_a.")
+    opacity: float = Field(0.1, gt=0.004, lt=0.99, description="Opacity score that all children start with.")
+
+
+class LossConfig(Part):
+    """Weights of Eq. 13-17; the l_* switches are the paper's ablations. Owner: `graings.training.losses`."""
+
+    ssim: float = Field(0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss.")
+    temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
+    deformation: float = Field(0.001, ge=0, description="lambda_2, magnitude of the deformation.")
+    residual: float = Field(0.01, ge=0, description="lambda_3, magnitude of the appearance residual.")
+    gain: float = Field(1.0, ge=0, description="Common factor on the three means over children (decision 10).")
+    temporal_share: float = Field(0.1, gt=0, le=1, description="Share of drawn children in the temporal term per step.")
+    l_temp: bool = Field(True, description="Ablation switch of the temporal term.")
+    l_def: bool = Field(True, description="Ablation switch of the deformation term.")
+    l_res: bool = Field(True, description="Ablation switch of the residual term.")
+
+
+class DensityConfig(Part):
+    """Growing and pruning. Owner: `graings.training.density`. Marks are of the 30 000 schedule."""
+
+    statistics_from: int = Field(500, ge=0, description="First iteration of the growth statistics.")
+    grow_from: int = Field(1_500, ge=0, description="First growth.")
+    grow_until: int = Field(20_000, ge=0, description="Last growth.")
+    grow_every: int = Field(100, ge=1, description="Iterations between growths (not scaled).")
+    gradient_threshold: float = Field(2e-4, gt=0, description="tau_g, mean screen gradient in NDC units.")
+    min_observations: int = Field(40, ge=0, description="tau_obs, times a child must have been drawn (not scaled).")
+    levels: int = Field(3, ge=1, le=6, description="Cell sizes 4^(levels-1) v ... v.")
+    max_anchors: int = Field(12_000, ge=16, description="Hard budget of anchors; the largest gradients win.")
+    prune_from: int = Field(24_600, ge=0, description="First pruning: 80 % of the joint phase.")
+    prune_until: int = Field(29_000, ge=0, description="Last pruning.")
+    prune_every: int = Field(500, ge=1, description="Iterations between prunings.")
+    prune_opacity: float = Field(0.005, ge=0, description="Anchors whose summed child opacity stays below are removed.")
+    prune_visits: int = Field(
+        80, ge=1, description="Views an anchor must have been seen in before it may go (not scaled)."
+    )
+
+
+class RatesConfig(Part):
+    """Adam learning rates, first and last (log-linear between). Owner: `graings.training.optimizer`."""
+
+    offsets: tuple[float, float] = (0.01, 1e-4)
+    features: tuple[float, float] = (0.0075, 0.0075)
+    log_scales: tuple[float, float] = (0.007, 0.007)
+    opacity_offsets: tuple[float, float] = (0.02, 0.002)
+    static: tuple[float, float] = (0.004, 0.0004)
+    color: tuple[float, float] = (0.008, 5e-5)
+    opacity: tuple[float, float] = (0.002, 2e-5)
+    residual: tuple[float, float] = (0.002, 2e-5)
+    deformation: tuple[float, float] = (1.6e-3, 1.6e-5)
+
+
+class EvaluationConfig(Part):
+    """Held-out evaluation and checkpoints during a run. Owner: `graings.training.run`."""
+
+    first: int = Field(50, ge=1, description="Iteration of the first evaluation.")
+    factor: float = Field(1.5, gt=1, description="Each evaluation comes this many times later than the last.")
+    views: int = Field(8, ge=1, description="Held-out views per evaluation during training (all at the end).")
+    checkpoint_every: int = Field(1_000, ge=1, description="Iterations between checkpoints.")
+
+
+class TrainConfig(Part):
+    """One training run."""
+
+    preset: Literal["draft", "standard", "paper"] = Field("standard", description="Where the defaults come from.")
+    iterations: int = Field(10_000, ge=1, le=1_000_000, description="Optimisation steps.")
+    warmup: int = Field(3_000, ge=0, description="Static warm-up T_w, of the 30 000 schedule.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Seed of every random stream.")
+    threads: int | None = Field(None, ge=1, le=256, description="CPU threads; null takes all cores.")
+    capture: CaptureConfig = CaptureConfig()
+    scene: SceneConfig = SceneConfig()
+    init: InitConfig = InitConfig()
+    loss: LossConfig = LossConfig()
+    density: DensityConfig = DensityConfig()
+    rates: RatesConfig = RatesConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+    def scaled(self, mark: int) -> int:
+        """An iteration mark of the 30 000 schedule, in this run's iterations."""
+        return round(mark * self.iterations / PAPER_ITERATIONS)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {"iterations": 2_000, "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 6_000}},
+    "standard": {"iterations": 10_000},
+    "paper": {"iterations": PAPER_ITERATIONS},
+}
+
+
+def make_config(preset: str = "standard", overrides: dict[str, Any] | None = None) -> TrainConfig:
+    """A preset with overrides, which are nested like the config or flat with dotted keys (`"loss.ssim": 0.1`).
+
+    Raises `ConfigError` naming the field for anything unknown or out of range.
+    """
+    overrides = dict(overrides or {})
+    preset = str(overrides.pop("preset", preset))
+    if preset not in PRESETS:
+        raise ConfigError(f"preset: unknown preset {preset!r}. Choose one of {', '.join(PRESETS)}.")
+    values: dict[str, Any] = {"preset": preset}
+    _merge(values, PRESETS[preset])
+    _merge(values, overrides)
+    try:
+        return TrainConfig.model_validate(values)
+    except ValidationError as error:
+        problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise ConfigError(f"{problems}. `graings options` lists every field with its bounds.") from error
+
+
+def _merge(into: dict[str, Any], values: dict[str, Any]) -> None:
+    for key, value in values.items():
+        head, _, rest = key.partition(".")
+        if rest:
+            value = {rest: value}
+        if isinstance(value, dict):
+            child = into.setdefault(head, {})
+            if not isinstance(child, dict):
+                raise ConfigError(f"{head}: is a value, it has no part {next(iter(value))!r}.")
+            _merge(child, value)
+        else:
+            into[head] = value
+
+
+def options() -> dict[str, Any]:
+    """JSON schema of every option with default, bounds and help, and the presets."""
+    return {
+        "schema": TrainConfig.model_json_schema(),
+        "presets": {name: make_config(name).model_dump(mode="json") for name in PRESETS},
+    }

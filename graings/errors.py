@@ -1,0 +1,52 @@
+"""What can go wrong with the outside world.
+
+    GraingsError
+    ├── CaptureError      a file of the capture is missing, broken or contradicts another
+    ├── ConfigError       an option is unknown or out of range
+    ├── CheckpointError   a run folder or checkpoint cannot be read or written
+    ├── KernelError       the compiled kernel is absent or cannot run on this CPU
+    └── DivergedError     training cannot continue; the best checkpoint is kept
+
+Each message names the file or field and what to do about it. Misuse by a caller is a plain
+`ValueError` where it happens. Knows nothing of HTTP statuses or exit codes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class GraingsError(Exception):
+    """Root of every error a user can meet."""
+
+
+class CaptureError(GraingsError):
+    """A capture cannot be used as it is.
+
+    `file` is the offending file (relative to the capture where possible), `field` the key or image
+    property in it, `remedy` what the user can do.
+    """
+
+    def __init__(self, problem: str, *, file: Path | str, field: str | None = None, remedy: str) -> None:
+        self.problem = problem
+        self.file = str(file)
+        self.field = field
+        self.remedy = remedy
+        where = self.file if field is None else f"{self.file}, {field}"
+        super().__init__(f"{where}: {problem}. {remedy}")
+
+
+class ConfigError(GraingsError):
+    """An option is unknown, of the wrong type or out of range."""
+
+
+class CheckpointError(GraingsError):
+    """A run folder or checkpoint cannot be read or written."""
+
+
+class KernelError(GraingsError):
+    """The compiled kernel is missing or does not run on this CPU."""
+
+
+class DivergedError(GraingsError):
+    """Training cannot continue; the last good checkpoint is kept."""

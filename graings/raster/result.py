@@ -1,0 +1,48 @@
+"""RenderResult and RasterSettings: what comes out of a rasterizer, and the constants of the call.
+
+Shared by the kernel and its oracle. Knows nothing of how either works.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from graings import constants
+
+
+@dataclass(frozen=True, slots=True)
+class RasterSettings:
+    """Constants of one call; the defaults define the picture (`graings.constants`).
+
+    `alpha_min = transmittance_min = 0` is the untruncated sum of Eq. (2). `compat` is for comparison with
+    public rasterizers only: exclusive stop (the Gaussian that would cross the line is not blended) and the
+    square footprint of three standard deviations.
+    """
+
+    alpha_min: float = constants.ALPHA_MIN
+    transmittance_min: float = constants.TRANSMITTANCE_MIN
+    alpha_max: float = constants.ALPHA_MAX
+    blur: float = constants.BLUR
+    near: float = constants.NEAR
+    frustum_margin: float = constants.FRUSTUM_MARGIN
+    compat: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderResult:
+    """One rendered view; images are [height, width, ...] in the dtype of the Gaussians.
+
+    `depth` is the blended sum of w_i Z_i (normalised units, 0 where nothing is drawn; divide by `alpha` for
+    the expected depth). `means2d` [N, 2] in pixels and `radii` [N, 2] (half-widths of the footprint in
+    pixels, 0 = not drawn) carry no gradient.
+    """
+
+    color: Float[Tensor, "height width 3"]
+    alpha: Float[Tensor, "height width"]
+    depth: Float[Tensor, "height width"]
+    means2d: Float[Tensor, "gaussian 2"]
+    radii: Float[Tensor, "gaussian 2"]
+    culled: dict[str, int]  # why Gaussians were not drawn: non_finite, zero_quat, behind, faint, outside

@@ -1,0 +1,1 @@
+"""Durable training jobs. Knows no HTTP."""

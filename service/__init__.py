@@ -1,0 +1,1 @@
+"""Thin HTTP over jobs and models. Never trains."""
