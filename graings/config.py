@@ -59,7 +59,7 @@ class SceneConfig(Part):
     deformation: Literal["child", "anchor", "none"] = Field(
         "child", description="child: an offset per Gaussian (the method); anchor: broadcast per anchor; none: static."
     )
-    stop_gradient: bool = Field(True, description="Detach the canonical position before DeformNet (Eq. 6).")
+    stop_gradient: bool = Field(True, description="Detach the canonical position before DeformNet (Eq. 7).")
     single_mlp: bool = Field(False, description="Ablation: one network for canonical and temporal geometry.")
     residual: bool = Field(True, description="Temporal appearance residual (Eq. 12).")
     residual_stop_gradient: bool = Field(True, description="Detach the anchor feature before the residual field.")
@@ -82,7 +82,7 @@ class InitConfig(Part):
 
 
 class LossConfig(Part):
-    """Weights of Eq. 13-17; the l_* switches are the paper's ablations. Owner: `graings.training.losses`."""
+    """Weights of Eq. 14-18; the l_* switches are the paper's ablations. Owner: `graings.training.losses`."""
 
     ssim: float = Field(0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss.")
     temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
@@ -105,6 +105,9 @@ class DensityConfig(Part):
     gradient_threshold: float = Field(2e-4, gt=0, description="tau_g, mean screen gradient in NDC units.")
     min_observations: int = Field(40, ge=0, description="tau_obs, times a child must have been drawn (not scaled).")
     levels: int = Field(3, ge=1, le=6, description="Cell sizes 4^(levels-1) v ... v.")
+    newborn_opacity: float | None = Field(
+        0.05, gt=0.004, lt=0.99, description="Opacity score of a new anchor's brightest child; null inherits the parent's."
+    )
     max_anchors: int = Field(12_000, ge=16, description="Hard budget of anchors; the largest gradients win.")
     prune_from: int = Field(24_600, ge=0, description="First pruning: 80 % of the joint phase.")
     prune_until: int = Field(29_000, ge=0, description="Last pruning.")

@@ -1,0 +1,233 @@
+"""Checkpoint: a model on disk, and everything needed to continue training it.
+
+A run folder holds `checkpoints/<iteration>/` with `scene.safetensors` (the model), `state.safetensors` (what
+only training needs) and `checkpoint.json` (the rest). A checkpoint appears whole or not at all: it is written
+to a temporary folder, flushed and renamed. No pickle anywhere. Knows nothing of captures or jobs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from graings.camera import Camera, View
+from graings.config import SceneConfig, TrainConfig
+from graings.errors import CheckpointError
+from graings.scene.scaffold import Scaffold
+from graings.scene.scene import Scene
+from graings.units import Units
+
+FORMAT = "graings.checkpoint/1"
+FOLDER = "checkpoints"
+KEEP = 2
+
+_SCENE_FILE = "scene.safetensors"
+_STATE_FILE = "state.safetensors"
+_FACTS_FILE = "checkpoint.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """A trained scene with what is needed to look at it: units, background and the capture's views."""
+
+    scene: Scene
+    units: Units
+    background: tuple[float, float, float]
+    views: Mapping[str, tuple[View, ...]]
+    config: TrainConfig
+    iteration: int
+    finished: bool
+    digest: str
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingState:
+    """What only the trainer needs: tensors and JSON facts, opaque to this module."""
+
+    tensors: dict[str, Tensor]
+    facts: dict[str, Any]
+
+
+def scene_bytes(scene: Scene) -> int:
+    """Bytes of everything needed to render, float32 (decision 22); uids break ties and count."""
+    return sum(t.numel() * t.element_size() for t in scene.state_dict().values())
+
+
+def save_checkpoint(
+    run: Path,
+    *,
+    scene: Scene,
+    state: TrainingState,
+    units: Units,
+    background: Sequence[float],
+    views: Mapping[str, Sequence[View]],
+    config: TrainConfig,
+    iteration: int,
+    finished: bool,
+) -> Path:
+    """Write a checkpoint and drop all but the last two. Returns its folder; `CheckpointError` on a full disk."""
+    folder = run / FOLDER
+    final = folder / f"{iteration:08d}"
+    part = folder / f".{iteration:08d}.part"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        save_file(_contiguous(scene.state_dict()), part / _SCENE_FILE)
+        save_file(_contiguous(state.tensors), part / _STATE_FILE)
+        digest = hashlib.sha256((part / _SCENE_FILE).read_bytes()).hexdigest()
+        facts = {
+            "format": FORMAT,
+            "iteration": iteration,
+            "finished": finished,
+            "digest": digest,
+            "temporal": scene.temporal,
+            "scene_config": scene.config.model_dump(mode="json"),
+            "config": config.model_dump(mode="json"),
+            "units": asdict(units),
+            "background": list(background),
+            "views": {split: [_view_to_json(view) for view in members] for split, members in views.items()},
+            "state": state.facts,
+        }
+        (part / _FACTS_FILE).write_text(json.dumps(facts, allow_nan=False))
+        for file in part.iterdir():
+            _flush(file)
+        _flush(part)
+        old = folder / f".{iteration:08d}.old"
+        shutil.rmtree(old, ignore_errors=True)
+        if final.exists():
+            # The same iteration again (finishing right after a periodic checkpoint): the new one replaces it.
+            final.rename(old)
+        part.rename(final)
+        shutil.rmtree(old, ignore_errors=True)
+        _flush(folder)
+    except OSError as error:
+        shutil.rmtree(part, ignore_errors=True)
+        raise CheckpointError(
+            f"{final}: cannot write the checkpoint ({error}). Free some space; earlier ones are kept."
+        ) from error
+    for outdated in _checkpoints(run)[:-KEEP]:
+        shutil.rmtree(outdated, ignore_errors=True)
+    return final
+
+
+def newest_checkpoint(run: Path) -> Path | None:
+    """The newest whole checkpoint of a run folder, or None."""
+    found = _checkpoints(run)
+    return found[-1] if found else None
+
+
+def load_model(path: Path) -> Model:
+    """The model in a run folder (its newest checkpoint) or in a checkpoint folder. Raises `CheckpointError`."""
+    folder = _resolve(path)
+    facts = _read_facts(folder)
+    try:
+        config = TrainConfig.model_validate(facts["config"])
+        scene = _scene_from(
+            load_file(folder / _SCENE_FILE), SceneConfig.model_validate(facts["scene_config"]), facts["temporal"]
+        )
+        units = facts["units"]
+        return Model(
+            scene=scene,
+            units=Units(
+                tuple(units["center"]), units["scale"], units["time_start"], units["time_span"], tuple(units["up"])
+            ),
+            background=tuple(facts["background"]),
+            views={split: tuple(map(_view_from_json, views)) for split, views in facts["views"].items()},
+            config=config,
+            iteration=facts["iteration"],
+            finished=facts["finished"],
+            digest=facts["digest"],
+            path=folder,
+        )
+    except (OSError, SafetensorError, ValidationError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{folder}: damaged checkpoint ({error}). Use an earlier one or train again.") from error
+
+
+def load_state(path: Path) -> TrainingState:
+    """What the trainer stored beside the model. Raises `CheckpointError`."""
+    folder = _resolve(path)
+    try:
+        return TrainingState(load_file(folder / _STATE_FILE), _read_facts(folder)["state"])
+    except (OSError, SafetensorError, KeyError) as error:
+        raise CheckpointError(
+            f"{folder}: damaged training state ({error}). Resume from an earlier checkpoint."
+        ) from error
+
+
+def _checkpoints(run: Path) -> list[Path]:
+    folder = run / FOLDER
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if p.name.isdigit() and (p / _FACTS_FILE).is_file())
+
+
+def _resolve(path: Path) -> Path:
+    if (path / _FACTS_FILE).is_file():
+        return path
+    newest = newest_checkpoint(path)
+    if newest is None:
+        raise CheckpointError(f"{path}: no checkpoint here. Give a run folder that has trained for a while.")
+    return newest
+
+
+def _read_facts(folder: Path) -> dict[str, Any]:
+    try:
+        facts = json.loads((folder / _FACTS_FILE).read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{folder / _FACTS_FILE}: not readable ({error}). Use an earlier checkpoint.") from error
+    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+        raise CheckpointError(f"{folder / _FACTS_FILE}: not in the format {FORMAT}. It was written by another version.")
+    return facts
+
+
+def _scene_from(tensors: dict[str, Tensor], config: SceneConfig, temporal: bool) -> Scene:
+    rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
+    # Weights are overwritten at once; the global random stream is left as it was.
+    with torch.random.fork_rng(devices=[]):
+        scene = Scene(config, Scaffold(**rows), extent=float(tensors["extent"]), initial_opacity=0.1)
+    scene.load_state_dict(tensors)
+    scene.temporal = temporal
+    return scene
+
+
+def _contiguous(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.detach().contiguous().clone() for name, tensor in tensors.items()}
+
+
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _view_to_json(view: View) -> dict[str, Any]:
+    camera = view.camera
+    return {
+        "name": view.name,
+        "time": view.time,
+        "world_to_camera": camera.world_to_camera.tolist(),
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "size": [camera.width, camera.height],
+    }
+
+
+def _view_from_json(facts: dict[str, Any]) -> View:
+    camera = Camera(np.array(facts["world_to_camera"]), *facts["intrinsics"], *facts["size"])
+    return View(facts["name"], camera, facts["time"])

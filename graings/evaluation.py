@@ -1,0 +1,80 @@
+"""Evaluation: how close rendered views come to held-out images.
+
+Knows nothing of training.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from graings.capture.capture import Capture, Frame
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.checkpoint import load_model
+from graings.errors import CheckpointError
+from graings.metrics import Lpips, SplitMetrics, measure
+from graings.render import render
+from graings.report import read_metrics, write_metrics
+from graings.scene.scene import Scene
+
+
+def evaluate(
+    scene: Scene,
+    frames: Sequence[Frame],
+    images: ImageStore,
+    background: Sequence[float],
+    *,
+    lpips: Lpips | None = None,
+    threads: int | None = None,
+) -> SplitMetrics:
+    """Metrics of `scene` on `frames`: each view rendered at its own camera and time."""
+
+    views = []
+    for frame in frames:
+        rendered = render(scene, frame.camera, frame.time, background, threads=threads)
+        color = rendered.color.clamp(0, 1).numpy()
+        views.append(measure(frame.name, frame.time, color, images.rgb(frame), lpips))
+    return SplitMetrics.over(views, None if lpips is None else lpips.reason)
+
+
+def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:
+    """At most `size` frames chosen by the hash of their names: fixed for a capture, spread over it."""
+    if len(frames) <= size:
+        return tuple(frames)
+    order = sorted(range(len(frames)), key=lambda i: hashlib.sha256(frames[i].name.encode()).digest())
+    return tuple(frames[i] for i in sorted(order[:size]))
+
+
+def evaluate_run(run: Path, split: str, capture: Path | None = None, *, threads: int | None = None) -> SplitMetrics:
+    """Evaluate the newest model of a run on one split and write the result into its `metrics.json`.
+
+    The capture is found where it was at training time unless given. Raises `CheckpointError` when the run has
+    no model or the capture is not the one it was trained on.
+    """
+    model = load_model(run)
+    facts = json.loads((run / "run.json").read_text())
+    data = load_capture(capture or Path(facts["capture"]["path"]), model.config.capture)
+    if data.content_hash != facts["capture"]["hash"]:
+        raise CheckpointError(
+            f"{data.root}: not the capture this run was trained on. Give the original with --capture."
+        )
+    frames = _split(data, split)
+    images = ImageStore(model.background, model.config.capture.cache_mb)
+    metrics = evaluate(model.scene, frames, images, model.background, lpips=Lpips(), threads=threads)
+    document = read_metrics(run / "metrics.json")
+    document["splits"][split] = metrics.to_json()
+    write_metrics(run / "metrics.json", document)
+    return metrics
+
+
+def _split(capture: Capture, name: str) -> tuple[Frame, ...]:
+    if name == "val":
+        return capture.val
+    if name == "test":
+        return capture.test
+    if name == "train":
+        return capture.train
+    raise ValueError(f"split must be train, val or test, got {name!r}")

@@ -1,0 +1,93 @@
+"""Plan: what this scene does not need, each with its reason.
+
+Only decisions that lose nothing are taken by themselves here: what is left out could not have changed the
+reachable pictures. Knows nothing of how the parts work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from graings.capture.capture import Capture
+from graings.config import TrainConfig
+
+SCHEMA = "graings.plan/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """One component and what becomes of it. `kind` says why that is safe: the same function (exact), a
+    function the rest can represent (representable), or the user's word (user)."""
+
+    component: str
+    decision: Literal["keep", "drop"]
+    kind: Literal["exact", "representable", "user"]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The decisions for one capture and configuration."""
+
+    decisions: tuple[Decision, ...]
+
+    def drops(self, component: str) -> bool:
+        """Whether `component` is left out."""
+        return any(d.component == component and d.decision == "drop" for d in self.decisions)
+
+    def apply(self, config: TrainConfig) -> TrainConfig:
+        """The configuration without what the plan leaves out."""
+        scene, loss = {}, {}
+        if self.drops("deformation"):
+            scene["deformation"] = "none"
+        if self.drops("residual"):
+            scene["residual"] = False
+        if self.drops("temporal_loss"):
+            loss["l_temp"] = False
+        return config.model_copy(
+            update={"scene": config.scene.model_copy(update=scene), "loss": config.loss.model_copy(update=loss)}
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The plan as a JSON document."""
+        return {"schema": SCHEMA, "decisions": [asdict(decision) for decision in self.decisions]}
+
+
+def make_plan(capture: Capture, config: TrainConfig) -> Plan:
+    """Decide what to leave out for `capture`."""
+    instants = len(capture.times)
+    decisions = []
+
+    def decide(
+        component: str, drop: bool, reason: str, kind: Literal["exact", "representable"] = "representable"
+    ) -> None:
+        decisions.append(Decision(component, "drop" if drop else "keep", kind, reason))
+
+    single = instants == 1
+    noun = "1 distinct training time" if single else f"{instants} distinct training times"
+    if config.scene.deformation == "none":
+        decisions.append(Decision("deformation", "drop", "user", "scene.deformation is none"))
+    else:
+        decide(
+            "deformation", single, f"{noun}: {'the canonical state is the only state' if single else 'things may move'}"
+        )
+    if not config.scene.residual:
+        decisions.append(Decision("residual", "drop", "user", "scene.residual is off"))
+    else:
+        decide(
+            "residual", single, f"{noun}: {'the canonical colour can be any colour' if single else 'light may change'}"
+        )
+    static = single or config.scene.deformation == "none"
+    decide("temporal_loss", static, "no pair of times" if static else f"{noun}", "exact")
+    cloud = capture.points is not None
+    decide("random_points", cloud, "the capture brings its own points" if cloud else "no point cloud in the capture")
+    decide(
+        "alpha_carving",
+        cloud or not capture.has_alpha,
+        "no masks needed"
+        if cloud
+        else ("masks say where there is nothing" if capture.has_alpha else "the images have no alpha channel"),
+        "exact",
+    )
+    return Plan(tuple(decisions))

@@ -1,0 +1,53 @@
+"""render: the one path from a scene to a picture.
+
+Training, evaluation, export and serving all pass here; scene and rasterizer meet nowhere else. Knows
+nothing of images on disk, losses or HTTP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from graings.camera import Camera
+from graings.raster.rasterize import rasterize
+from graings.raster.result import RasterSettings, RenderResult
+from graings.scene.scene import Composition, Scene
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    time: float,
+    background: Sequence[float],
+    *,
+    settings: RasterSettings | None = None,
+    threads: int | None = None,
+) -> RenderResult:
+    """The scene at `time` in [0, 1] from `camera` on a `background` RGB in [0, 1], without gradients."""
+    with torch.inference_mode():
+        return draw(scene.compose(camera.center, time), camera, background, settings=settings, threads=threads)
+
+
+def draw(
+    composition: Composition,
+    camera: Camera,
+    background: Sequence[float],
+    *,
+    means2d_offset: Float[Tensor, "gaussian 2"] | None = None,
+    settings: RasterSettings | None = None,
+    threads: int | None = None,
+) -> RenderResult:
+    """Rasterize a composition; gradients flow to it and to `means2d_offset` (pixels, see `rasterize`)."""
+    gaussians = composition.gaussians
+    return rasterize(
+        gaussians,
+        camera,
+        torch.tensor(list(background), dtype=gaussians.means.dtype),
+        means2d_offset=means2d_offset,
+        settings=settings or RasterSettings(),
+        threads=threads,
+    )

@@ -1,0 +1,76 @@
+"""Appearance: canonical colour and opacity heads (Eq. 11) and the bounded temporal residual (Eq. 12).
+
+All heads run once per anchor and give one value per child slot (decision 1). Knows nothing of geometry,
+time encoding aside, or of pixels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from graings.config import SceneConfig
+from graings.scene.encoding import encoding_width, frequency_encoding
+
+
+class CanonicalAppearance(nn.Module):
+    """F_c and F_o: (f_a, v) -> colour in (0, 1) and opacity score in (-1, 1) per child slot, Eq. 11.
+
+    With `opacity_view` off F_o sees the feature only: in a monocular capture the viewing direction names the
+    frame, and opacity could then switch children per frame instead of moving them (decision 8).
+    """
+
+    def __init__(self, config: SceneConfig, initial_opacity: float) -> None:
+        super().__init__()
+        k, width = config.children, config.head_width
+        self.opacity_view = config.opacity_view
+        self.color = nn.Sequential(nn.Linear(config.feature_dim + 3, width), nn.ReLU(), nn.Linear(width, 3 * k))
+        opacity_inputs = config.feature_dim + (3 if config.opacity_view else 0)
+        self.opacity = nn.Sequential(nn.Linear(opacity_inputs, width), nn.ReLU(), nn.Linear(width, k))
+        last = self.opacity[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.weight.mul_(0.1)  # all children start near the same, visible, opacity (A18)
+            last.bias.fill_(math.atanh(initial_opacity))
+
+    def colors(
+        self, features: Float[Tensor, "anchor feature"], directions: Float[Tensor, "anchor 3"]
+    ) -> Float[Tensor, "anchor child 3"]:
+        """c_can of every child slot."""
+        raw: Tensor = self.color(torch.cat([features, directions], dim=-1))
+        return raw.sigmoid().unflatten(-1, (-1, 3))
+
+    def opacity_logits(
+        self, features: Float[Tensor, "anchor feature"], directions: Float[Tensor, "anchor 3"]
+    ) -> Float[Tensor, "anchor child"]:
+        """F_o before the tanh, for every child slot."""
+        inputs = torch.cat([features, directions], dim=-1) if self.opacity_view else features
+        raw: Tensor = self.opacity(inputs)
+        return raw
+
+
+class ResidualField(nn.Module):
+    """F_res: (f_a, gamma(t)) -> (Delta c, Delta o) per child slot, bounded by eta, Eq. 12; zero at birth."""
+
+    def __init__(self, config: SceneConfig) -> None:
+        super().__init__()
+        self.scale = config.residual_scale
+        self.time_frequencies = config.time_frequencies
+        self.from_feature = nn.Linear(config.feature_dim, config.head_width)
+        self.from_time = nn.Linear(encoding_width(1, config.time_frequencies), config.head_width, bias=False)
+        self.out = nn.Linear(config.head_width, 4 * config.children)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(
+        self, features: Float[Tensor, "anchor feature"], time: Float[Tensor, 1]
+    ) -> tuple[Float[Tensor, "anchor child 3"], Float[Tensor, "anchor child"]]:
+        """(Delta c, Delta o) at `time` in [0, 1]."""
+        moment = self.from_time(frequency_encoding(time, self.time_frequencies))
+        hidden = functional.relu(self.from_feature(features) + moment)
+        raw = self.scale * torch.tanh(self.out(hidden)).unflatten(-1, (-1, 4))
+        return raw[..., :3], raw[..., 3]

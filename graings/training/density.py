@@ -1,0 +1,218 @@
+"""Density: where anchors should grow and which may go (decisions only; the optimizer resizes).
+
+Growth follows the mean screen-space gradient of each child (Eq. 6) on a multi-resolution voxel grid. Knows
+nothing of rendering; it is told gradients, observations and opacities.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from graings import constants
+from graings.config import DensityConfig
+from graings.scene.scaffold import Scaffold
+
+# Never prune below this many anchors.
+MIN_ANCHORS = 16
+
+# At most this share of the anchors (and at least MIN_GROWTH) is added at once.
+MAX_GROWTH = 0.1
+MIN_GROWTH = 1_000
+
+# A cell of the next finer level is this many times smaller.
+LEVEL_DIVISOR = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """New anchors: rows for every name in `Scaffold.ROWS`, and whether a budget cut the list."""
+
+    rows: dict[str, Tensor]
+    capped: bool
+
+    def __len__(self) -> int:
+        return len(self.rows["anchors"])
+
+
+class DensityStatistics:
+    """What was observed since the last reset; float64 sums and int64 counts.
+
+    `gradient` and `drawn` [A, k]: sum of NDC gradient norms and times drawn, per child. `opacity` and `visits`
+    [A]: sum over visits of the summed positive child scores, and times the anchor was in view.
+    """
+
+    NAMES = ("gradient", "drawn", "opacity", "visits")
+
+    def __init__(self, anchors: int, children: int) -> None:
+        self.gradient = torch.zeros(anchors, children, dtype=torch.float64)
+        self.drawn = torch.zeros(anchors, children, dtype=torch.int64)
+        self.opacity = torch.zeros(anchors, dtype=torch.float64)
+        self.visits = torch.zeros(anchors, dtype=torch.int64)
+
+    def observe(
+        self,
+        children: Int64[Tensor, " gaussian"],
+        screen_gradient: Float[Tensor, "gaussian 2"],
+        visible: Bool[Tensor, " gaussian"],
+        opacities: Float[Tensor, "anchor child"],
+        size: tuple[int, int],
+    ) -> None:
+        """Record one step.
+
+        `children` are flat slots, `screen_gradient` is dL/d(mean in pixels), `visible` says which Gaussians
+        touched the image of `size` (width, height), `opacities` are the scores of every slot.
+        """
+        half = torch.tensor([size[0] / 2.0, size[1] / 2.0], dtype=torch.float64)
+        norms = (screen_gradient.double() * half).norm(dim=-1)
+        seen = children[visible]
+        self.gradient.view(-1).index_add_(0, seen, norms[visible])
+        self.drawn.view(-1).index_add_(0, seen, torch.ones_like(seen))
+        owners = torch.unique(seen // opacities.shape[1])
+        # An anchor without a drawn child is seen too: its opacity is what pruning wants to know.
+        hidden = opacities.amax(dim=-1) <= constants.ALPHA_MIN
+        hidden[owners] = True
+        self.visits += hidden
+        self.opacity += opacities.clamp_min(0).sum(-1).double() * hidden
+
+    def resize(self, keep: Bool[Tensor, " anchor"] | None = None, append: int = 0) -> None:
+        """Follow the scaffold: drop rows outside `keep`, then add `append` empty ones."""
+        for name in self.NAMES:
+            rows: Tensor = getattr(self, name)
+            if keep is not None:
+                rows = rows[keep]
+            setattr(self, name, torch.cat([rows, rows.new_zeros((append, *rows.shape[1:]))]))
+
+    def forget_grown(self, min_observations: int) -> None:
+        """Start anew for children that were observed often enough to be judged."""
+        judged = self.drawn > min_observations
+        self.gradient[judged] = 0
+        self.drawn[judged] = 0
+
+    def state(self) -> dict[str, Tensor]:
+        """Sums and counts by name."""
+        return {name: getattr(self, name) for name in self.NAMES}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Continue from what `state()` gave."""
+        for name in self.NAMES:
+            setattr(self, name, state[name].clone())
+
+
+def voxel_keys(positions: Float[Tensor, "point 3"], cell: float) -> Int64[Tensor, "point 3"]:
+    """Integer cell of each position: round(x / cell) in float64, so that far coordinates keep their cell."""
+    return torch.floor(positions.double() / cell + 0.5).to(torch.int64)
+
+
+def grow(
+    scaffold: Scaffold,
+    statistics: DensityStatistics,
+    logits: Float[Tensor, "anchor child"],
+    config: DensityConfig,
+    voxel_size: float,
+    next_uid: int,
+    generator: torch.Generator,
+) -> Growth:
+    """Choose new anchors (Eq. 6 and the paragraph below it).
+
+    A child is a candidate on level i when drawn more than tau_obs times with mean gradient of at least
+    tau_g 2^i; 1 - 2^-(i+1) of them are kept at random. Cells shrink 4-fold per level down to `voxel_size`. Each
+    free cell gets one anchor at its node with the element-wise maximum of the candidates' features, zero
+    offsets and a scale of one cell. `logits` are the opacity logits of every slot at the mean direction.
+    """
+    observed = statistics.drawn > config.min_observations
+    mean = torch.where(observed, statistics.gradient / statistics.drawn.clamp_min(1), 0.0).flatten()
+    positions = (
+        scaffold.anchors.unsqueeze(1) + scaffold.log_scales.detach().exp().unsqueeze(1) * scaffold.offsets.detach()
+    ).flatten(0, 1)
+    fresh: dict[str, list[Tensor]] = {"anchors": [], "features": [], "log_scales": [], "score": [], "parent": []}
+    existing = scaffold.anchors
+    for level in range(config.levels):
+        cell = voxel_size * max(1, LEVEL_DIVISOR ** (config.levels - 1 - level))
+        kept = torch.rand(len(mean), generator=generator) > 0.5 ** (level + 1)
+        chosen = (observed.flatten() & (mean >= config.gradient_threshold * 2.0**level) & kept).nonzero().squeeze(-1)
+        if len(chosen) == 0:
+            continue
+        cells, member = torch.unique(voxel_keys(positions[chosen], cell), dim=0, return_inverse=True)
+        free = ~_contains(torch.unique(voxel_keys(existing, cell), dim=0), cells)
+        inside = free[member]
+        place = torch.cumsum(free, 0) - 1
+        count = int(free.sum())
+        if count == 0:
+            continue
+        member, chosen = place[member[inside]], chosen[inside]
+        owners = chosen // scaffold.children
+        features = torch.full((count, scaffold.features.shape[1]), -math.inf)
+        features = features.scatter_reduce(
+            0, member.unsqueeze(-1).expand(-1, features.shape[1]), scaffold.features.detach()[owners], "amax"
+        )
+        score = torch.zeros(count, dtype=torch.float64).scatter_reduce(0, member, mean[chosen], "amax")
+        # The parent is the candidate with the largest gradient in the cell (lowest slot on a tie).
+        parent = torch.full((count,), len(mean), dtype=torch.int64)
+        best = mean[chosen] == score[member]
+        parent = parent.scatter_reduce(0, member[best], chosen[best], "amin") // scaffold.children
+        nodes = (cells[free].double() * cell).to(scaffold.anchors.dtype)
+        fresh["anchors"].append(nodes)
+        fresh["features"].append(features)
+        fresh["log_scales"].append(torch.full((count, 3), math.log(cell)))
+        fresh["score"].append(score)
+        fresh["parent"].append(parent)
+        existing = torch.cat([existing, nodes])
+    if not fresh["anchors"]:
+        return Growth(_empty_rows(scaffold), capped=False)
+    new = {name: torch.cat(parts) for name, parts in fresh.items()}
+    room = max(0, config.max_anchors - scaffold.count)
+    room = min(room, max(MIN_GROWTH, int(MAX_GROWTH * scaffold.count)))
+    order = torch.argsort(new["score"], descending=True, stable=True)[:room].sort().values
+    return Growth(
+        {
+            "anchors": new["anchors"][order],
+            "uids": next_uid + torch.arange(len(order)),
+            "log_scales": new["log_scales"][order],
+            "features": new["features"][order],
+            "offsets": torch.zeros(len(order), scaffold.children, 3),
+            "opacity_offsets": newborn_offsets(scaffold, logits, new["parent"][order], config.newborn_opacity),
+        },
+        capped=len(order) < len(new["score"]),
+    )
+
+
+def newborn_offsets(
+    scaffold: Scaffold,
+    logits: Float[Tensor, "anchor child"],
+    parents: Int64[Tensor, " new"],
+    opacity: float | None,
+) -> Float[Tensor, " new"]:
+    """Opacity offsets that make the brightest child of each new anchor start at most at `opacity`.
+
+    None inherits the parent's offset as it is.
+    """
+    inherited = scaffold.opacity_offsets.detach()[parents]
+    if opacity is None:
+        return inherited
+    # `logits` contain the parent's offset, so the correction adds to it.
+    return inherited + (math.atanh(opacity) - logits[parents].amax(-1)).clamp_max(0.0)
+
+
+def prune(scaffold: Scaffold, statistics: DensityStatistics, config: DensityConfig) -> Bool[Tensor, " anchor"]:
+    """True for every anchor to keep: those not yet seen often enough, or with some opacity to show."""
+    judged = statistics.visits > config.prune_visits
+    faint = judged & (statistics.opacity < config.prune_opacity * statistics.visits)
+    keep = ~faint
+    if int(keep.sum()) < min(MIN_ANCHORS, scaffold.count):
+        return torch.ones_like(keep)
+    return keep
+
+
+def _contains(occupied: Int64[Tensor, "cell 3"], cells: Int64[Tensor, "query 3"]) -> Bool[Tensor, " query"]:
+    """Which of `cells` are among `occupied` (both without duplicates)."""
+    _, group, counts = torch.unique(torch.cat([occupied, cells]), dim=0, return_inverse=True, return_counts=True)
+    return counts[group[len(occupied) :]] > 1
+
+
+def _empty_rows(scaffold: Scaffold) -> dict[str, Tensor]:
+    return {name: getattr(scaffold, name).detach()[:0] for name in Scaffold.ROWS}

@@ -1,0 +1,126 @@
+"""Optimizer: Adam over named groups with log-linear rates, and rows that come and go with the anchors.
+
+Knows nothing of why an anchor is added or removed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor, nn
+
+from graings.config import RatesConfig, TrainConfig
+from graings.scene.scaffold import Scaffold
+from graings.scene.scene import Scene
+
+ADAM_EPSILON = 1e-15  # gradients of one Gaussian are tiny; the usual 1e-8 would damp them (3DGS)
+
+# Which group a parameter belongs to, by the head of its name in the scene.
+_GROUPS = {
+    "scaffold.offsets": "offsets",
+    "scaffold.features": "features",
+    "scaffold.log_scales": "log_scales",
+    "scaffold.opacity_offsets": "opacity_offsets",
+    "static": "static",
+    "single": "deformation",
+    "appearance.color": "color",
+    "appearance.opacity": "opacity",
+    "residual": "residual",
+    "deformation": "deformation",
+}
+
+# Groups that first move in the joint phase: their schedule spans it.
+TEMPORAL_GROUPS = ("residual", "deformation")
+
+
+def _group_of(name: str) -> str:
+    for head, group in _GROUPS.items():
+        if name == head or name.startswith(head + "."):
+            return group
+    raise ValueError(f"parameter {name} belongs to no optimiser group")
+
+
+class Optimizer:
+    """Adam for one scene.
+
+    `step(iteration)` sets the rates for that iteration, steps the groups whose parameters have gradients and
+    clears the gradients.
+    """
+
+    def __init__(self, scene: Scene, config: TrainConfig, joint_from: int) -> None:
+        self.scene = scene
+        self.rates: RatesConfig = config.rates
+        self.iterations = config.iterations
+        self.joint_from = joint_from
+        members: dict[str, list[nn.Parameter]] = {}
+        for name, parameter in scene.named_parameters():
+            members.setdefault(_group_of(name), []).append(parameter)
+        groups = [{"params": parameters, "name": group, "lr": 0.0} for group, parameters in members.items()]
+        self.adam = torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+
+    def rate(self, group: str, iteration: int) -> float:
+        """Learning rate of `group` at `iteration` (from 1): log-linear from first to last."""
+        first, last = getattr(self.rates, group)
+        start = self.joint_from if group in TEMPORAL_GROUPS else 0
+        progress = min(1.0, max(0.0, (iteration - start) / max(1, self.iterations - start)))
+        if first <= 0 or last <= 0:
+            return float(first + (last - first) * progress)
+        return math.exp(math.log(first) + (math.log(last) - math.log(first)) * progress)
+
+    def step(self, iteration: int) -> None:
+        """Apply the gradients at the rates of `iteration`."""
+        for group in self.adam.param_groups:
+            group["lr"] = self.rate(group["name"], iteration)
+        self.adam.step()
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop all gradients."""
+        self.adam.zero_grad(set_to_none=True)
+
+    def append(self, rows: dict[str, Tensor]) -> None:
+        """Add anchors: `rows` holds new rows for every name in `Scaffold.ROWS`; their moments start at zero."""
+        self._replace(lambda name, old: torch.cat([old, rows[name].to(old.dtype)]), _grow)
+
+    def keep(self, mask: Bool[Tensor, " anchor"]) -> None:
+        """Keep only the anchors where `mask` is true."""
+        self._replace(lambda name, old: old[mask], lambda moment, _: moment[mask])
+
+    def _replace(self, rows: Any, moments: Any) -> None:
+        scaffold: Scaffold = self.scene.scaffold
+        for name in Scaffold.ROWS:
+            old = getattr(scaffold, name)
+            if not isinstance(old, nn.Parameter):
+                setattr(scaffold, name, rows(name, old))
+                continue
+            new = nn.Parameter(rows(name, old.detach()))
+            setattr(scaffold, name, new)
+            for group in self.adam.param_groups:
+                group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+            state = self.adam.state.pop(old, None)
+            if state:
+                for moment in ("exp_avg", "exp_avg_sq"):
+                    state[moment] = moments(state[moment], new)
+                self.adam.state[new] = state
+
+    def state(self) -> dict[str, Tensor]:
+        """Adam's moments and step counts by parameter name."""
+        state: dict[str, Tensor] = {}
+        for name, parameter in self.scene.named_parameters():
+            for key, value in self.adam.state.get(parameter, {}).items():
+                state[f"{name}/{key}"] = value
+        return state
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Continue from what `state()` gave for a scene of the same shape."""
+        parameters = dict(self.scene.named_parameters())
+        for key, value in state.items():
+            name, _, field = key.rpartition("/")
+            self.adam.state[parameters[name]][field] = value.clone()
+
+
+def _grow(moment: Tensor, new: Tensor) -> Tensor:
+    return torch.cat([moment, moment.new_zeros((len(new) - len(moment), *moment.shape[1:]))])

@@ -1,0 +1,373 @@
+"""TrainingRun: one training in one folder — trainer, evaluations, checkpoints and metrics.
+
+Iterating it trains. Whoever iterates may stop at any step and call `save()`; `resume` continues bit for bit.
+Knows nothing of terminals, jobs or HTTP.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from graings.capture.capture import SPLITS, Capture, Frame
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.checkpoint import (
+    TrainingState,
+    load_model,
+    load_state,
+    newest_checkpoint,
+    save_checkpoint,
+    scene_bytes,
+)
+from graings.config import TrainConfig
+from graings.errors import CheckpointError
+from graings.evaluation import evaluate, subset
+from graings.machine import machine_facts, version_facts
+from graings.metrics import Lpips, SplitMetrics
+from graings.plan import Plan, make_plan
+from graings.render import render
+from graings.report import config_hash, curve_svg, write_metrics, write_text
+from graings.training.trainer import StepReport as TrainerReport
+from graings.training.trainer import Trainer
+
+SCHEMA = "graings.run/1"
+METRICS_SCHEMA = "graings.metrics/1"
+
+# The rate shown to the user is the mean over about this many recent seconds.
+RATE_WINDOW_S = 5.0
+
+# Frames per second are the median over this many views after one to warm up.
+FPS_VIEWS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationPoint:
+    """Held-out quality at one moment of training; `train_s` excludes evaluation and checkpoints."""
+
+    iteration: int
+    train_s: float
+    psnr: float
+    rmse: float
+    ssim_3dgs: float
+    views: int
+    gaussians: int
+    anchors: int
+
+
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """One step as a user wants to hear of it. `psnr` is of the training view just drawn, in dB."""
+
+    iteration: int
+    iterations: int
+    phase: str
+    loss: float
+    psnr: float
+    gaussians: int
+    anchors: int
+    iterations_per_s: float
+    train_s: float
+    evaluation: EvaluationPoint | None = None
+    events: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Clock:
+    """Seconds per phase; training, evaluation and saving never share a second."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def add(self, phase: str, seconds: float) -> None:
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + seconds
+
+    def train_s(self) -> float:
+        return sum(self.seconds.get(phase, 0.0) for phase in ("init", "warmup", "joint", "static"))
+
+    def total_s(self) -> float:
+        return sum(self.seconds.values())
+
+
+class TrainingRun:
+    """One run folder being trained. Make it with `create` or `resume`."""
+
+    def __init__(self, folder: Path, capture: Capture, config: TrainConfig, threads: int | None, clock: _Clock) -> None:
+        self.folder = folder
+        self.capture = capture
+        self.config = config
+        self.threads = threads if threads is not None else config.threads
+        if self.threads is not None:
+            torch.set_num_threads(self.threads)
+        self.plan: Plan = make_plan(capture, config)
+        self.applied = self.plan.apply(config)
+        self.images = ImageStore(config.capture.background_rgb(), config.capture.cache_mb)
+        self._clock = clock
+        started = time.perf_counter()
+        self._trainer = Trainer(capture, self.images, self.applied, threads=self.threads)
+        clock.add("init", time.perf_counter() - started)
+        self._curve: list[dict[str, Any]] = []
+        self._events: list[dict[str, Any]] = []
+        self._last_gaussians = 0
+
+    @classmethod
+    def create(cls, capture: Path, folder: Path, config: TrainConfig) -> TrainingRun:
+        """Start a run of `config` on the capture at `capture`; `folder` must be new or empty.
+
+        Raises `CaptureError` for the capture and `CheckpointError` for the folder.
+        """
+        if (folder / "run.json").exists():
+            raise CheckpointError(f"{folder}: already holds a run. Resume it (--resume) or choose another folder.")
+        clock = _Clock()
+        started = time.perf_counter()
+        data = load_capture(capture, config.capture)
+        clock.add("load", time.perf_counter() - started)
+        run = cls(folder, data, config, None, clock)
+        folder.mkdir(parents=True, exist_ok=True)
+        run._write_run()
+        return run
+
+    @classmethod
+    def resume(cls, folder: Path, *, capture: Path | None = None, threads: int | None = None) -> TrainingRun:
+        """Continue the run in `folder` from its newest checkpoint (from the start when there is none yet).
+
+        `capture` is where the capture lies now, if it moved. Raises `CheckpointError` when the folder holds no
+        run or the capture is another one.
+        """
+        try:
+            facts = json.loads((folder / "run.json").read_text())
+        except (OSError, ValueError) as error:
+            raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
+        config = TrainConfig.model_validate(facts["config"])
+        clock = _Clock()
+        started = time.perf_counter()
+        data = load_capture(capture or Path(facts["capture"]["path"]), config.capture)
+        if data.content_hash != facts["capture"]["hash"]:
+            raise CheckpointError(f"{data.root}: not the capture this run began with. Give the original one.")
+        clock.add("load", time.perf_counter() - started)
+        run = cls(folder, data, config, threads, clock)
+        if newest_checkpoint(folder) is not None:
+            state = load_state(folder)
+            run._trainer.load(load_model(folder).scene, state.tensors, state.facts["trainer"])
+            run._clock = _Clock(dict(state.facts["seconds"]))
+            run._curve = list(state.facts["curve"])
+            run._events = list(state.facts["events"])
+        return run
+
+    @property
+    def iteration(self) -> int:
+        """Iterations done."""
+        return self._trainer.iteration
+
+    @property
+    def iterations(self) -> int:
+        """Iterations wanted."""
+        return self.config.iterations
+
+    @property
+    def metrics_path(self) -> Path:
+        """Where the metrics document is."""
+        return self.folder / "metrics.json"
+
+    def __iter__(self) -> Iterator[StepReport]:
+        due = _evaluation_marks(self.config)
+        rate = _Rate()
+        for step in self._trainer:
+            self._clock.add(step.phase, step.seconds)
+            self._last_gaussians = step.gaussians
+            rate.add(step.seconds)
+            self._events += [{"iteration": step.iteration, "what": what} for what in step.events]
+            last = step.iteration == self.iterations
+            point = self._evaluate(step) if step.iteration in due and not last else None
+            if step.iteration % self.config.evaluation.checkpoint_every == 0 and not last:
+                self.save()
+            if last:
+                point = self._finish(step)
+            yield StepReport(
+                iteration=step.iteration,
+                iterations=step.iterations,
+                phase=step.phase,
+                loss=step.loss,
+                psnr=step.psnr,
+                gaussians=step.gaussians,
+                anchors=step.anchors,
+                iterations_per_s=rate.per_second(),
+                train_s=self._clock.train_s(),
+                evaluation=point,
+                events=step.events,
+            )
+
+    def save(self, *, finished: bool = False) -> Path:
+        """Write a checkpoint now; returns its folder. Raises `CheckpointError` when that fails."""
+        started = time.perf_counter()
+        tensors, facts = self._trainer.state()
+        path = save_checkpoint(
+            self.folder,
+            scene=self._trainer.scene,
+            state=TrainingState(
+                tensors,
+                {"trainer": facts, "seconds": self._clock.seconds, "curve": self._curve, "events": self._events},
+            ),
+            units=self.capture.units,
+            background=self.config.capture.background_rgb(),
+            views={split: [frame.view() for frame in self.capture.split(split)] for split in SPLITS},
+            config=self.config,
+            iteration=self.iteration,
+            finished=finished,
+        )
+        self._clock.add("checkpoint", time.perf_counter() - started)
+        return path
+
+    def _held_out(self) -> tuple[Frame, ...]:
+        """Views for the curve: never the test split."""
+        return subset(self.capture.val, self.config.evaluation.views)
+
+    def _evaluate(self, step: TrainerReport) -> EvaluationPoint | None:
+        frames = self._held_out()
+        if not frames:
+            return None
+        started = time.perf_counter()
+        metrics = evaluate(
+            self._trainer.scene, frames, self.images, self.config.capture.background_rgb(), threads=self.threads
+        )
+        point = self._point(step, metrics)
+        self._clock.add("evaluation", time.perf_counter() - started)
+        self._write_metrics({})
+        return point
+
+    def _point(self, step: TrainerReport, metrics: SplitMetrics) -> EvaluationPoint:
+        if metrics.psnr is None or metrics.ssim_3dgs is None:
+            raise ValueError("a point of the curve needs at least one view")
+        rmse = math.sqrt(sum(view.mse for view in metrics.views) / len(metrics.views))
+        point = EvaluationPoint(
+            iteration=step.iteration,
+            train_s=self._clock.train_s(),
+            psnr=metrics.psnr,
+            rmse=rmse,
+            ssim_3dgs=metrics.ssim_3dgs,
+            views=len(metrics.views),
+            gaussians=step.gaussians,
+            anchors=step.anchors,
+        )
+        self._curve.append(
+            {
+                "iteration": point.iteration,
+                "train_s": point.train_s,
+                "total_s": self._clock.total_s(),
+                "psnr": point.psnr,
+                "rmse": point.rmse,
+                "ssim_3dgs": point.ssim_3dgs,
+                "views": point.views,
+                "gaussians": point.gaussians,
+                "anchors": point.anchors,
+            }
+        )
+        return point
+
+    def _finish(self, step: TrainerReport) -> EvaluationPoint | None:
+        """Evaluate all of val, write the final checkpoint, metrics and curve."""
+        point, splits = None, {}
+        if self.capture.val:
+            started = time.perf_counter()
+            background = self.config.capture.background_rgb()
+            scene = self._trainer.scene
+            curve = self._held_out()
+            point = self._point(step, evaluate(scene, curve, self.images, background, threads=self.threads))
+            full = evaluate(scene, self.capture.val, self.images, background, lpips=Lpips(), threads=self.threads)
+            splits["val"] = full.to_json()
+            self._clock.add("evaluation", time.perf_counter() - started)
+        self.save(finished=True)
+        self._write_metrics(splits)
+        return point
+
+    def _write_run(self) -> None:
+        document = {
+            "schema": SCHEMA,
+            "capture": {
+                "path": str(self.capture.root.resolve()),
+                "hash": self.capture.content_hash,
+                "kind": self.capture.kind,
+                "notes": list(self.capture.notes),
+            },
+            "config": self.config.model_dump(mode="json"),
+            "plan": self.plan.to_json(),
+            "versions": version_facts(),
+        }
+        write_metrics(self.folder / "run.json", document)
+
+    def _write_metrics(self, splits: dict[str, Any]) -> None:
+        scene = self._trainer.scene
+        document = {
+            "schema": METRICS_SCHEMA,
+            "splits": splits,
+            "train_s": self._clock.train_s(),
+            "total_s": self._clock.total_s(),
+            "phases_s": dict(self._clock.seconds),
+            "iterations": self.iteration,
+            "gaussians": self._last_gaussians,
+            "anchors": scene.scaffold.count,
+            "bytes": {"fp32": scene_bytes(scene), "compact": None},
+            "render_fps": self._frames_per_second(),
+            "curve": self._curve,
+            "events": self._events,
+            "plan": self.plan.to_json(),
+            "capture": {
+                "frames": {split: len(self.capture.split(split)) for split in SPLITS},
+                "times": len(self.capture.times),
+                "width": self.capture.train[0].camera.width,
+                "height": self.capture.train[0].camera.height,
+                "background": list(self.config.capture.background_rgb()),
+                "notes": list(self.capture.notes),
+            },
+            "skipped_steps": self._trainer.guard.skipped,
+            "machine": machine_facts(self.threads),
+            "versions": version_facts(),
+            "seed": self.config.seed,
+            "hashes": {"config": config_hash(self.config), "capture": self.capture.content_hash},
+        }
+        write_metrics(self.metrics_path, document)
+        write_text(self.folder / "curve.svg", curve_svg(self._curve))
+
+    def _frames_per_second(self) -> float:
+        """Median speed of rendering training views at training size, geometry networks included."""
+        frames = subset(self.capture.train, FPS_VIEWS)
+        background = self.config.capture.background_rgb()
+        seconds = []
+        for frame in (frames[0], *frames):
+            started = time.perf_counter()
+            render(self._trainer.scene, frame.camera, frame.time, background, threads=self.threads)
+            seconds.append(time.perf_counter() - started)
+        measured = sorted(seconds[1:])
+        return 1.0 / max(measured[len(measured) // 2], 1e-9)
+
+
+class _Rate:
+    """Iterations per second over the last few seconds."""
+
+    def __init__(self) -> None:
+        self._recent: list[float] = []
+        self._sum = 0.0
+
+    def add(self, seconds: float) -> None:
+        self._recent.append(seconds)
+        self._sum += seconds
+        while len(self._recent) > 1 and self._sum - self._recent[0] > RATE_WINDOW_S:
+            self._sum -= self._recent.pop(0)
+
+    def per_second(self) -> float:
+        return len(self._recent) / max(self._sum, 1e-9)
+
+
+def _evaluation_marks(config: TrainConfig) -> frozenset[int]:
+    """Iterations at which to evaluate: geometrically spaced."""
+    marks, mark = set(), float(config.evaluation.first)
+    while mark < config.iterations:
+        marks.add(round(mark))
+        mark *= config.evaluation.factor
+    return frozenset(marks)

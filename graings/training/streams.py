@@ -1,0 +1,55 @@
+"""Streams: named random streams, so that leaving one part out does not change the numbers of another.
+
+Each name seeds its own generator. Knows nothing of what the numbers are used for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import torch
+from torch import Tensor
+
+
+class Streams:
+    """Generators by name, created on first use and saved whole."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self._generators: dict[str, torch.Generator] = {}
+
+    def __getitem__(self, name: str) -> torch.Generator:
+        if name not in self._generators:
+            digest = hashlib.sha256(f"{self.seed}/{name}".encode()).digest()
+            generator = torch.Generator()
+            generator.manual_seed(int.from_bytes(digest[:8], "big") >> 1)
+            self._generators[name] = generator
+        return self._generators[name]
+
+    def state(self) -> dict[str, Tensor]:
+        """State of every stream used so far."""
+        return {name: generator.get_state() for name, generator in sorted(self._generators.items())}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Continue where `state` was taken."""
+        for name, tensor in state.items():
+            self[name].set_state(tensor)
+
+
+class ViewSampler:
+    """Training views without replacement: every view once, in a new random order each round."""
+
+    def __init__(self, count: int, generator: torch.Generator) -> None:
+        if count < 1:
+            raise ValueError(f"count must be at least 1, got {count}")
+        self.count = count
+        self.generator = generator
+        self.remaining = torch.empty(0, dtype=torch.int64)
+
+    def next(self) -> int:
+        """Index of the next view."""
+        if len(self.remaining) == 0:
+            self.remaining = torch.randperm(self.count, generator=self.generator)
+        index = int(self.remaining[0])
+        self.remaining = self.remaining[1:]
+        return index

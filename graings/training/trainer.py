@@ -1,0 +1,258 @@
+"""Trainer: an iterator of StepReports over the paper's two phases.
+
+Never prints, logs, saves or asks: whoever iterates decides. Knows nothing of files.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from graings.capture.capture import Capture, Frame
+from graings.capture.images import ImageStore
+from graings.config import TrainConfig
+from graings.render import draw
+from graings.scene.scene import Composition, Scene
+from graings.training import density, losses
+from graings.training.density import DensityStatistics
+from graings.training.guard import Guard
+from graings.training.initialize import make_scene
+from graings.training.optimizer import Optimizer
+from graings.training.streams import Streams, ViewSampler
+
+# The temporal term looks at no fewer children than this (decision 10).
+MIN_TEMPORAL_SAMPLE = 2_000
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """Iterations `first` to `last` (inclusive, from 1); `temporal` switches the time modules on."""
+
+    name: Literal["warmup", "joint", "static"]
+    first: int
+    last: int
+    temporal: bool
+
+
+def phases(config: TrainConfig) -> tuple[Phase, ...]:
+    """The schedule of a run: static warm-up then joint training, or one static phase."""
+    scene = config.scene
+    has_time = scene.residual or scene.single_mlp or scene.deformation != "none"
+    if not has_time:
+        return (Phase("static", 1, config.iterations, temporal=False),)
+    warmup = config.scaled(config.warmup) if scene.canonical else 0
+    joint = Phase("joint", warmup + 1, config.iterations, temporal=True)
+    return (Phase("warmup", 1, warmup, temporal=False), joint) if warmup else (joint,)
+
+
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """One step: what it did and what it cost. `psnr` is that of the training view just drawn, in dB."""
+
+    iteration: int
+    iterations: int
+    phase: str
+    loss: float
+    psnr: float
+    gaussians: int
+    anchors: int
+    seconds: float
+    events: tuple[str, ...] = ()
+
+
+class Trainer:
+    """Optimises a scene on a capture. Iterating trains one step at a time from `iteration` on."""
+
+    def __init__(
+        self, capture: Capture, images: ImageStore, config: TrainConfig, *, threads: int | None = None
+    ) -> None:
+        self.capture = capture
+        self.images = images
+        self.config = config
+        self.threads = threads
+        self.background = config.capture.background_rgb()
+        self.phases = phases(config)
+        self.streams = Streams(config.seed)
+        self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
+        self.times = capture.times
+        self.iteration = 0
+        self.scene, self.voxel_size = make_scene(capture, images, config, self.streams)
+        self.next_uid = self.scene.scaffold.count
+        self._attach()
+
+    def _attach(self) -> None:
+        """Everything whose shape follows the scene."""
+        scaffold = self.scene.scaffold
+        self.optimizer = Optimizer(self.scene, self.config, joint_from=self.phases[-1].first - 1)
+        self.statistics = DensityStatistics(scaffold.count, scaffold.children)
+        self.guard = Guard()
+
+    def __iter__(self) -> Iterator[StepReport]:
+        while self.iteration < self.config.iterations:
+            yield self.step()
+
+    def phase(self, iteration: int) -> Phase:
+        """The phase that `iteration` (from 1) belongs to."""
+        return next(phase for phase in self.phases if iteration <= phase.last)
+
+    def step(self) -> StepReport:
+        """Take one step. Raises `DivergedError` where the guard gives up."""
+        started = time.perf_counter()
+        self.iteration += 1
+        phase = self.phase(self.iteration)
+        self.scene.temporal = phase.temporal
+        frame = self.capture.train[self.sampler.next()]
+        target = torch.from_numpy(self.images.rgb(frame))
+
+        composition = self.scene.compose(frame.camera.center, frame.time)
+        offset = torch.zeros(len(composition.gaussians), 2, requires_grad=True)
+        result = draw(composition, frame.camera, self.background, means2d_offset=offset, threads=self.threads)
+        image_loss = losses.photometric(result.color, target, self.config.loss.ssim)
+        loss = image_loss + self._regularisers(composition, frame)
+        # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.
+        if loss.requires_grad:
+            loss.backward()
+
+        events: list[str] = []
+        if self.guard.passes(loss.detach(), self.scene.named_parameters()):
+            if self._counts_statistics() and offset.grad is not None:
+                visible = result.radii.amax(-1) > 0
+                self.statistics.observe(
+                    composition.children,
+                    offset.grad,
+                    visible,
+                    composition.opacities,
+                    (frame.camera.width, frame.camera.height),
+                )
+            self.optimizer.step(self.iteration)
+        else:
+            self.optimizer.clear()
+            events.append(f"skipped: non-finite step on {frame.name}")
+        events += self._adapt()
+        mse = float((result.color.detach() - target).square().mean())
+        return StepReport(
+            iteration=self.iteration,
+            iterations=self.config.iterations,
+            phase=phase.name,
+            loss=float(loss.detach()),
+            psnr=-10.0 * math.log10(max(mse, 1e-10)),
+            gaussians=len(composition.gaussians),
+            anchors=self.scene.scaffold.count,
+            seconds=time.perf_counter() - started,
+            events=tuple(events),
+        )
+
+    def _regularisers(self, composition: Composition, frame: Frame) -> Tensor:
+        """The weighted temporal, deformation and residual terms of Eq. 14; zero in the static phase."""
+        config = self.config.loss
+        total = torch.zeros(())
+        moved = composition.deformation
+        if moved is not None and len(composition.children) > 0:
+            if config.l_def:
+                total = total + config.gain * config.deformation * losses.deformation(moved)
+            if config.l_temp and len(self.times) > 1:
+                total = total + config.gain * config.temporal * self._temporal(composition, frame)
+        if composition.residual is not None and config.l_res and len(composition.children) > 0:
+            total = total + config.gain * config.residual * losses.residual(composition.residual)
+        return total
+
+    def _temporal(self, composition: Composition, frame: Frame) -> Tensor:
+        """Eq. 16 between this frame's time and one neighbouring training time, on a sample of the children."""
+        assert composition.deformation is not None
+        generator = self.streams["time_pairs"]
+        here = int(abs(self.times - frame.time).argmin())
+        side = 1 if int(torch.randint(2, (1,), generator=generator)) else -1
+        there = here + side if 0 <= here + side < len(self.times) else here - side
+        count = len(composition.children)
+        size = min(count, max(MIN_TEMPORAL_SAMPLE, int(self.config.loss.temporal_share * count)))
+        sample = torch.randperm(count, generator=generator)[:size]
+        neighbour = self.scene.deform(
+            composition.children[sample], composition.canonical_means[sample], float(self.times[there])
+        )
+        assert neighbour is not None
+        span = float(self.times[-1] - self.times[0])
+        gap = abs(float(self.times[there] - self.times[here]))
+        return losses.temporal(
+            composition.deformation.position[sample], neighbour.position, gap, span / (len(self.times) - 1)
+        )
+
+    def _counts_statistics(self) -> bool:
+        config, scaled = self.config.density, self.config.scaled
+        growing = scaled(config.statistics_from) < self.iteration <= scaled(config.grow_until)
+        return growing or scaled(config.grow_until) < self.iteration <= scaled(config.prune_until)
+
+    def _adapt(self) -> list[str]:
+        """Grow and prune where the schedule says so; returns what happened, in words."""
+        config, scaled = self.config.density, self.config.scaled
+        events: list[str] = []
+        if (
+            scaled(config.grow_from) <= self.iteration <= scaled(config.grow_until)
+            and self.iteration % config.grow_every == 0
+        ):
+            events += self._grow()
+        every = max(1, scaled(config.prune_every))
+        if scaled(config.prune_from) <= self.iteration <= scaled(config.prune_until) and self.iteration % every == 0:
+            keep = density.prune(self.scene.scaffold, self.statistics, config)
+            removed = int((~keep).sum())
+            if removed:
+                self.optimizer.keep(keep)
+                self.statistics.resize(keep=keep)
+                events.append(f"pruned {removed} anchors")
+        return events
+
+    def _grow(self) -> list[str]:
+        scene, config = self.scene, self.config.density
+        with torch.no_grad():
+            # The mean direction stands for all views: where opacity looks at it, a newborn has no camera yet.
+            still = torch.zeros_like(scene.scaffold.anchors)
+            logits = scene.appearance.opacity_logits(scene.scaffold.features, still)
+            logits = logits + scene.scaffold.opacity_offsets.unsqueeze(-1)
+            growth = density.grow(
+                scene.scaffold, self.statistics, logits, config, self.voxel_size, self.next_uid, self.streams["growth"]
+            )
+        self.statistics.forget_grown(config.min_observations)
+        if len(growth) == 0:
+            return []
+        self.optimizer.append(growth.rows)
+        self.statistics.resize(append=len(growth))
+        self.next_uid += len(growth)
+        return [f"grew {len(growth)} anchors"] + (["growth capped by the budget"] if growth.capped else [])
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything beside the scene that the next step depends on: tensors and JSON."""
+        tensors = {f"adam/{name}": value for name, value in self.optimizer.state().items()}
+        tensors |= {f"statistics/{name}": value for name, value in self.statistics.state().items()}
+        tensors |= {f"streams/{name}": value for name, value in self.streams.state().items()}
+        tensors["sampler/remaining"] = self.sampler.remaining
+        facts = {
+            "iteration": self.iteration,
+            "next_uid": self.next_uid,
+            "voxel_size": self.voxel_size,
+            "skipped": self.guard.skipped,
+            "consecutive_skips": self.guard.consecutive,
+        }
+        return tensors, facts
+
+    def load(self, scene: Scene, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
+        """Continue from a scene and what `state()` gave with it."""
+        self.scene = scene
+        self._attach()
+        parts: dict[str, dict[str, Tensor]] = {"adam": {}, "statistics": {}, "streams": {}, "sampler": {}}
+        for key, value in tensors.items():
+            part, _, name = key.partition("/")
+            parts[part][name] = value
+        self.optimizer.load(parts["adam"])
+        self.statistics.load(parts["statistics"])
+        self.streams.load(parts["streams"])
+        self.sampler.remaining = parts["sampler"]["remaining"].clone()
+        self.iteration = int(facts["iteration"])
+        self.next_uid = int(facts["next_uid"])
+        self.voxel_size = float(facts["voxel_size"])
+        self.guard.skipped = int(facts["skipped"])
+        self.guard.consecutive = int(facts["consecutive_skips"])
