@@ -1,0 +1,35 @@
+"""What a rasterizer accepts beyond what `Gaussians` and `Camera` already check.
+
+Shared by the kernel's front and its oracle, so that both refuse the same calls with the same words.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from graings.gaussians import Gaussians
+
+
+def check_arguments(
+    gaussians: Gaussians, background: Tensor, means2d_offset: Tensor | None, threads: int | None
+) -> None:
+    """Raise `ValueError` naming the argument, what was expected and what came."""
+    dtype = gaussians.means.dtype
+    _check("background", background, (3,), dtype)
+    if means2d_offset is not None:
+        _check("means2d_offset", means2d_offset, (len(gaussians), 2), dtype)
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads must be at least 1, got {threads}")
+    for name in ("means", "quats", "log_scales", "opacities", "colors", "uids"):
+        device = getattr(gaussians, name).device
+        if device.type != "cpu":
+            raise ValueError(f"{name} must be on the CPU, got {device}")
+
+
+def _check(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: object) -> None:
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
+    if tensor.dtype != dtype:
+        raise ValueError(f"{name} must be {dtype} like the Gaussians, got {tensor.dtype}")
+    if tensor.device.type != "cpu":
+        raise ValueError(f"{name} must be on the CPU, got {tensor.device}")
