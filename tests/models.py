@@ -1,0 +1,37 @@
+"""Tiny scenes for tests: a few anchors with random values, every module awake."""
+
+from __future__ import annotations
+
+import torch
+
+from graings.config import SceneConfig
+from graings.scene.scaffold import Scaffold
+from graings.scene.scene import Scene
+
+EYE = (0.0, -2.0, 0.5)
+
+
+def tiny_scene(
+    *, anchors: int = 20, seed: int = 0, temporal: bool = True, awake: bool = True, **config: object
+) -> Scene:
+    """A scene of `anchors` anchors in the unit ball; `awake` gives the zero-born layers random weights."""
+    settings = SceneConfig.model_validate(
+        {"children": 3, "feature_dim": 8, "head_width": 8, "static_width": 8, "deform_width": 16, "deform_depth": 2}
+        | config
+    )
+    torch.manual_seed(seed)
+    scaffold = Scaffold(
+        anchors=torch.randn(anchors, 3) * 0.3,
+        log_scales=torch.full((anchors, 3), -2.5) + 0.1 * torch.randn(anchors, 3),
+        features=torch.randn(anchors, settings.feature_dim),
+        offsets=torch.randn(anchors, settings.children, 3) * 0.3,
+    )
+    scene = Scene(settings, scaffold, extent=1.0, initial_opacity=0.3)
+    if awake:
+        with torch.no_grad():
+            for module in (scene.deformation, scene.residual):
+                if module is not None:
+                    module.out.weight.normal_(std=0.1)
+                    module.out.bias.normal_(std=0.1)
+    scene.temporal = temporal
+    return scene

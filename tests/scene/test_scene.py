@@ -1,0 +1,179 @@
+"""The model: Eq. 3-13 of the paper, one sentence a test."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from graings import constants
+from graings.scene.clip import clip
+from graings.scene.deformation import Deformation, quaternion_product
+from graings.scene.encoding import encoding_width, frequency_encoding
+from tests.models import EYE, tiny_scene
+
+
+def test_child_centres_follow_anchor_scale_and_offset() -> None:
+    scaffold = tiny_scene().scaffold
+    children = torch.tensor([0, 4, 59])
+    centres = scaffold.centres(children)
+    for row, child in zip(centres, children.tolist(), strict=True):
+        anchor, slot = divmod(child, 3)
+        expected = scaffold.anchors[anchor] + scaffold.log_scales[anchor].exp() * scaffold.offsets[anchor, slot]
+        assert torch.equal(row, expected)
+
+
+def test_untrained_deformation_and_residual_are_identity() -> None:
+    awake = tiny_scene(awake=False, temporal=True).compose(EYE, 0.7)
+    static = tiny_scene(awake=False, temporal=False).compose(EYE, 0.7)
+    assert torch.equal(awake.gaussians.means, static.gaussians.means)
+    assert torch.equal(awake.gaussians.log_scales, static.gaussians.log_scales)
+    assert torch.equal(awake.gaussians.colors, static.gaussians.colors)
+    assert torch.equal(awake.gaussians.opacities, static.gaussians.opacities)
+    assert torch.allclose(awake.gaussians.quats, static.gaussians.quats, atol=1e-7)
+
+
+def test_gradient_of_canonical_mean_is_bitwise_that_of_the_moved_mean() -> None:
+    # Eq. 9: with the stop-gradient dL/dx_can = dL/dx(t), nothing else.
+    composition = tiny_scene().compose(EYE, 0.4)
+    composition.canonical_means.retain_grad()
+    composition.gaussians.means.retain_grad()
+    means = composition.gaussians.means
+    (means.sin() * torch.linspace(0.1, 2.0, means.numel()).view_as(means)).sum().backward()
+    assert composition.canonical_means.grad is not None
+    assert torch.equal(composition.canonical_means.grad, means.grad)
+
+
+def test_without_stop_gradient_the_deformation_reaches_the_canonical_mean() -> None:
+    composition = tiny_scene(stop_gradient=False).compose(EYE, 0.4)
+    composition.canonical_means.retain_grad()
+    composition.gaussians.means.retain_grad()
+    composition.gaussians.means.sin().sum().backward()
+    assert not torch.allclose(composition.canonical_means.grad, composition.gaussians.means.grad, atol=1e-4)
+
+
+def test_deformation_sends_no_gradient_to_the_scaffold() -> None:
+    scene = tiny_scene()
+    composition = scene.compose(EYE, 0.4)
+    moved = composition.deformation
+    assert moved is not None
+    (moved.position.sum() + moved.rotation.sum() + moved.log_scales.sum()).backward()
+    assert all(parameter.grad is None for parameter in scene.scaffold.parameters())
+    assert scene.deformation is not None
+    assert scene.deformation.out.weight.grad is not None
+
+
+def test_residual_sends_no_gradient_to_the_features_unless_asked() -> None:
+    for stop, expected in ((True, None), (False, torch.Tensor)):
+        scene = tiny_scene(residual_stop_gradient=stop)
+        residual = scene.compose(EYE, 0.4).residual
+        assert residual is not None
+        residual.square().sum().backward()
+        grad = scene.scaffold.features.grad
+        assert grad is None if expected is None else grad is not None
+
+
+def test_static_scene_evaluates_no_temporal_module() -> None:
+    scene = tiny_scene(temporal=False)
+    composition = scene.compose(EYE, 0.4)
+    assert composition.deformation is None
+    assert composition.residual is None
+    composition.gaussians.means.sum().backward()
+    assert scene.deformation is not None
+    assert all(parameter.grad is None for parameter in scene.deformation.parameters())
+
+
+def test_only_children_above_one_grey_level_are_drawn() -> None:
+    scene = tiny_scene()
+    with torch.no_grad():
+        scene.scaffold.opacity_offsets.normal_(std=0.5)
+    composition = scene.compose(EYE, 0.4)
+    drawn = composition.opacities.flatten() > constants.ALPHA_MIN
+    assert 0 < int(drawn.sum()) < drawn.numel()
+    assert torch.equal(composition.children, drawn.nonzero().squeeze(-1))
+    assert torch.equal(composition.gaussians.opacities, composition.opacities.flatten()[drawn])
+
+
+def test_residual_is_bounded_by_eta() -> None:
+    scene = tiny_scene(residual_scale=0.1)
+    with torch.no_grad():
+        scene.residual.out.weight.mul_(1e3)
+    composition = scene.compose(EYE, 0.4)
+    assert float(composition.residual.detach().abs().max()) <= 0.1 + 1e-7
+    assert float(composition.gaussians.colors.detach().amin()) >= 0.0
+    assert float(composition.gaussians.colors.detach().amax()) <= 1.0
+
+
+def test_each_child_moves_by_itself_and_broadcast_moves_anchors_whole() -> None:
+    for mode, spread in (("child", True), ("anchor", False)):
+        composition = tiny_scene(deformation=mode).compose(EYE, 0.4)
+        moved = composition.deformation.position.detach()
+        owners = composition.children // 3
+        varies = any(
+            not torch.allclose(moved[owners == anchor], moved[owners == anchor][:1], atol=1e-7)
+            for anchor in owners.unique()
+        )
+        assert varies is spread
+
+
+@pytest.mark.parametrize(
+    "ablation", [{"single_mlp": True}, {"canonical": False}, {"residual": False}, {"deformation": "none"}]
+)
+def test_every_structural_ablation_gives_finite_gaussians_and_gradients(ablation: dict[str, object]) -> None:
+    scene = tiny_scene(**ablation)
+    gaussians = scene.compose(EYE, 0.4).gaussians
+    (gaussians.means.sum() + gaussians.quats.sum() + gaussians.log_scales.sum() + gaussians.colors.sum()).backward()
+    for name, parameter in scene.named_parameters():
+        if parameter.grad is not None:
+            assert bool(torch.isfinite(parameter.grad).all()), name
+
+
+def test_opacity_ignores_the_view_unless_asked() -> None:
+    for view, same in ((False, True), (True, False)):
+        scene = tiny_scene(opacity_view=view)
+        here = scene.compose(EYE, 0.4).opacities
+        there = scene.compose((2.0, 0.0, 0.5), 0.4).opacities
+        assert torch.equal(here, there) is same
+
+
+def test_camera_on_an_anchor_gives_finite_colours() -> None:
+    scene = tiny_scene()
+    gaussians = scene.compose(scene.scaffold.anchors[0].tolist(), 0.4).gaussians
+    assert bool(torch.isfinite(gaussians.colors).all())
+
+
+def test_temporal_pair_reuses_the_same_network() -> None:
+    scene = tiny_scene()
+    composition = scene.compose(EYE, 0.4)
+    again = scene.deform(composition.children, composition.canonical_means, 0.4)
+    assert torch.equal(again.position, composition.deformation.position)
+
+
+def test_quaternion_product_is_rotation_after_rotation() -> None:
+    half = math.sqrt(0.5)
+    about_x, about_y = torch.tensor([[half, half, 0, 0]]), torch.tensor([[half, 0, half, 0]])
+    assert torch.allclose(quaternion_product(about_x, about_y), torch.tensor([[0.5, 0.5, 0.5, 0.5]]), atol=1e-7)
+
+
+def test_log_scale_change_is_clipped_at_two() -> None:
+    moved = Deformation(torch.zeros(2, 3), torch.zeros(2, 4), torch.tensor([[3.0, 0.5, -9.0], [0.0, 0.0, 0.0]]))
+    _, _, log_scales = moved.apply(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2, 3), projected_clip=True)
+    assert torch.equal(log_scales[0], torch.tensor([2.0, 0.5, -2.0]))
+
+
+def test_projected_clip_passes_only_gradients_that_point_back_inside() -> None:
+    x = torch.tensor([-1.0, -1.0, 0.5, 2.0, 2.0], requires_grad=True)
+    clip(x, 0.0, 1.0, projected=True).backward(torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0]))
+    assert torch.equal(x.grad, torch.tensor([0.0, -1.0, 1.0, 1.0, 0.0]))
+    x.grad = None
+    clip(x, 0.0, 1.0, projected=False).backward(torch.ones(5))
+    assert torch.equal(x.grad, torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0]))
+
+
+def test_encoding_has_the_stated_width_and_values() -> None:
+    encoded = frequency_encoding(torch.tensor([0.25, 0.5]), 2)
+    assert encoded.shape == (encoding_width(2, 2),)
+    phases = [0.25, 0.5, 0.5, 1.0]
+    expected = [0.25, 0.5, *map(math.sin, phases), *map(math.cos, phases)]
+    assert torch.allclose(encoded, torch.tensor(expected), atol=1e-7)

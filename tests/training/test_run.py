@@ -1,0 +1,192 @@
+"""Whole runs on a tiny capture: learn, resume, freeze, leave out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from graings.capture.synthetic import write_synthetic
+from graings.checkpoint import load_model, newest_checkpoint
+from graings.config import TrainConfig, make_config
+from graings.errors import CheckpointError
+from graings.evaluation import evaluate_run
+from graings.training.run import TrainingRun
+
+ITERATIONS = 60
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_synthetic(tmp_path_factory.mktemp("capture") / "tiny", seed=1, frames=12, size=32, bodies=2)
+
+
+def _config(**overrides: object) -> TrainConfig:
+    # Growth, pruning, warm-up, evaluation and a checkpoint all fall inside these few iterations.
+    small = {
+        "iterations": ITERATIONS,
+        "threads": 1,
+        "warmup": 10_000,
+        "init.points": 800,
+        "scene.children": 4,
+        "density.statistics_from": 500,
+        "density.grow_from": 4_000,
+        "density.grow_every": 8,
+        "density.min_observations": 2,
+        "density.prune_from": 22_000,
+        "density.prune_visits": 2,
+        "density.prune_opacity": 0.05,
+        "evaluation.first": 10,
+        "evaluation.checkpoint_every": 37,
+    }
+    return make_config("draft", small | overrides)
+
+
+def _tensors(run: Path) -> dict[str, torch.Tensor]:
+    return load_model(run).scene.state_dict()
+
+
+def test_training_lowers_the_held_out_error_and_writes_everything(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config(iterations=200))
+    reports = list(run)
+    assert [report.iteration for report in reports] == list(range(1, 201))
+    assert {report.phase for report in reports} == {"warmup", "joint"}
+    points = [report.evaluation for report in reports if report.evaluation is not None]
+    assert points[-1].psnr > points[0].psnr + 3
+    document = json.loads((tmp_path / "run" / "metrics.json").read_text(), parse_constant=_refuse)
+    for key in (
+        "schema splits train_s total_s iterations gaussians anchors bytes render_fps curve machine versions seed hashes"
+    ).split():
+        assert key in document, key
+    assert list(document["splits"]) == ["val"]
+    assert document["splits"]["val"]["lpips_vgg"] is not None or document["splits"]["val"]["lpips_reason"]
+    assert len(document["curve"]) == len(points)
+    assert (tmp_path / "run" / "curve.svg").read_text().lstrip().startswith(("<svg", "<?xml"))
+    assert load_model(tmp_path / "run").finished
+
+
+def _refuse(constant: str) -> float:
+    raise AssertionError(f"{constant} is not strict JSON")
+
+
+def test_a_run_resumed_from_any_checkpoint_equals_the_unbroken_run_bit_for_bit(capture: Path, tmp_path: Path) -> None:
+    unbroken = TrainingRun.create(capture, tmp_path / "unbroken", _config())
+    events = [event for report in unbroken for event in report.events]
+    assert any("grew" in event for event in events)
+    assert any("pruned" in event for event in events)
+    expected = _tensors(tmp_path / "unbroken")
+    for stop in (5, 23, 41, 53):
+        folder = tmp_path / f"stopped_{stop}"
+        broken = TrainingRun.create(capture, folder, _config())
+        for report in broken:
+            if report.iteration == stop:
+                break
+        broken.save()
+        list(TrainingRun.resume(folder, threads=1))
+        resumed = _tensors(folder)
+        assert resumed.keys() == expected.keys()
+        for name, tensor in expected.items():
+            assert torch.equal(resumed[name], tensor), f"{name} after a stop at {stop}"
+
+
+def test_resuming_without_a_checkpoint_starts_over(capture: Path, tmp_path: Path) -> None:
+    TrainingRun.create(capture, tmp_path / "run", _config())
+    assert TrainingRun.resume(tmp_path / "run", threads=1).iteration == 0
+
+
+def test_only_the_last_two_checkpoints_are_kept(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config(**{"evaluation.checkpoint_every": 10}))
+    list(run)
+    assert sorted(p.name for p in (tmp_path / "run" / "checkpoints").iterdir()) == ["00000050", "00000060"]
+
+
+def test_warmup_leaves_temporal_modules_untouched_and_the_joint_phase_moves_them(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config())
+    trainer = run._trainer
+    temporal = {
+        name: parameter.detach().clone()
+        for name, parameter in trainer.scene.named_parameters()
+        if name.startswith(("deformation", "residual"))
+    }
+    assert temporal
+    still = dict(trainer.scene.named_parameters())
+    for report in run:
+        if report.phase == "warmup":
+            for name, before in temporal.items():
+                assert torch.equal(still[name], before), name
+                assert still[name] not in trainer.optimizer.adam.state
+    assert any(not torch.equal(still[name], before) for name, before in temporal.items())
+
+
+def test_a_folder_with_a_run_is_not_overwritten(capture: Path, tmp_path: Path) -> None:
+    TrainingRun.create(capture, tmp_path / "run", _config())
+    with pytest.raises(CheckpointError, match="already holds a run"):
+        TrainingRun.create(capture, tmp_path / "run", _config())
+
+
+def test_another_capture_is_refused_on_resume(capture: Path, tmp_path: Path) -> None:
+    TrainingRun.create(capture, tmp_path / "run", _config())
+    other = write_synthetic(tmp_path / "other", seed=2, frames=12, size=32, bodies=2)
+    with pytest.raises(CheckpointError, match="not the capture"):
+        TrainingRun.resume(tmp_path / "run", capture=other)
+
+
+def test_a_damaged_checkpoint_is_named(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config())
+    next(iter(run))
+    run.save()
+    newest = newest_checkpoint(tmp_path / "run")
+    (newest / "scene.safetensors").write_bytes(b"not a tensor file")
+    with pytest.raises(CheckpointError, match="damaged checkpoint"):
+        load_model(tmp_path / "run")
+
+
+def test_test_split_is_measured_only_when_asked(capture: Path, tmp_path: Path) -> None:
+    list(TrainingRun.create(capture, tmp_path / "run", _config()))
+    metrics = evaluate_run(tmp_path / "run", "test", threads=1)
+    document = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert document["splits"]["test"]["psnr"] == metrics.psnr
+    assert set(document["splits"]) == {"val", "test"}
+
+
+def test_a_single_instant_leaves_the_deformation_out_and_says_so(capture: Path, tmp_path: Path) -> None:
+    still = tmp_path / "still"
+    still.mkdir()
+    for name in ("train", "val", "test"):
+        facts = json.loads((capture / f"transforms_{name}.json").read_text())
+        for frame in facts["frames"]:
+            del frame["time"]
+        (still / f"transforms_{name}.json").write_text(json.dumps(facts))
+        (still / name).mkdir()
+        for image in (capture / name).iterdir():
+            (still / name / image.name).write_bytes(image.read_bytes())
+    run = TrainingRun.create(still, tmp_path / "run", _config(iterations=20))
+    assert {report.phase for report in run} == {"static"}
+    assert load_model(tmp_path / "run").scene.deformation is None
+    decisions = json.loads((tmp_path / "run" / "metrics.json").read_text())["plan"]["decisions"]
+    dropped = {d["component"]: d["reason"] for d in decisions if d["decision"] == "drop"}
+    assert "1 distinct training time" in dropped["deformation"]
+    assert {"deformation", "residual", "temporal_loss"} <= set(dropped)
+
+
+@pytest.mark.parametrize(
+    "ablation",
+    [
+        {"scene.stop_gradient": False},
+        {"loss.l_temp": False},
+        {"loss.l_def": False},
+        {"loss.l_res": False},
+        {"scene.single_mlp": True},
+        {"scene.residual": False},
+        {"scene.canonical": False},
+        {"scene.deformation": "anchor"},
+    ],
+)
+def test_every_ablation_of_the_paper_trains_and_renders(
+    capture: Path, tmp_path: Path, ablation: dict[str, object]
+) -> None:
+    reports = list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=30, **ablation)))
+    assert reports[-1].evaluation is not None
+    assert reports[-1].evaluation.psnr > 8
