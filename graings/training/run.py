@@ -279,7 +279,7 @@ class TrainingRun:
             scene = self._trainer.scene
             curve = self._held_out()
             point = self._point(step, evaluate(scene, curve, self.images, background, threads=self.threads))
-            full = evaluate(scene, self.capture.val, self.images, background, lpips=Lpips(), threads=self.threads)
+            full = evaluate(scene, self.capture.val, self.images, background, lpips=Lpips.find(), threads=self.threads)
             splits["val"] = full.to_json()
             self._clock.add("evaluation", time.perf_counter() - started)
         self.save(finished=True)
