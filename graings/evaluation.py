@@ -63,7 +63,7 @@ def evaluate_run(run: Path, split: str, capture: Path | None = None, *, threads:
         )
     frames = _split(data, split)
     images = ImageStore(model.background, model.config.capture.cache_mb)
-    metrics = evaluate(model.scene, frames, images, model.background, lpips=Lpips(), threads=threads)
+    metrics = evaluate(model.scene, frames, images, model.background, lpips=Lpips.find(), threads=threads)
     document = read_metrics(run / "metrics.json")
     document["splits"][split] = metrics.to_json()
     write_metrics(run / "metrics.json", document)

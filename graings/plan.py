@@ -38,7 +38,8 @@ class Plan:
 
     def apply(self, config: TrainConfig) -> TrainConfig:
         """The configuration without what the plan leaves out."""
-        scene, loss = {}, {}
+        scene: dict[str, object] = {}
+        loss: dict[str, object] = {}
         if self.drops("deformation"):
             scene["deformation"] = "none"
         if self.drops("residual"):

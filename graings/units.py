@@ -35,11 +35,13 @@ class Units:
 
     def points(self, points: ArrayLike) -> NDArray[np.float64]:
         """Capture positions [..., 3] in normalised units."""
-        return (np.asarray(points, dtype=np.float64) - np.asarray(self.center)) * self.scale
+        shifted: NDArray[np.float64] = np.asarray(points, dtype=np.float64) - np.asarray(self.center)
+        return shifted * self.scale
 
     def points_back(self, points: ArrayLike) -> NDArray[np.float64]:
         """Normalised positions [..., 3] in the capture's units."""
-        return np.asarray(points, dtype=np.float64) / self.scale + np.asarray(self.center)
+        scaled: NDArray[np.float64] = np.asarray(points, dtype=np.float64) / self.scale
+        return scaled + np.asarray(self.center)
 
     def camera(self, world_to_camera: ArrayLike) -> NDArray[np.float64]:
         """A capture's world-to-camera pose [4, 4] in normalised units."""

@@ -31,6 +31,6 @@ class _ProjectedClip(torch.autograd.Function):
 def clip(x: Tensor, low: float, high: float, *, projected: bool) -> Tensor:
     """`x` limited to [low, high]; `projected` chooses the gradient (see the module docstring)."""
     if projected:
-        result: Tensor = _ProjectedClip.apply(x, low, high)
+        result: Tensor = _ProjectedClip.apply(x, low, high)  # type: ignore[no-untyped-call]
         return result
     return x.clamp(low, high)

@@ -48,17 +48,17 @@ class Scaffold(nn.Module):
         return int(self.anchors.shape[0])
 
     @property
-    def children(self) -> int:
+    def slots(self) -> int:
         """Child slots per anchor k."""
         return int(self.offsets.shape[1])
 
     def centres(self, children: Int64[Tensor, " drawn"]) -> Float[Tensor, "drawn 3"]:
         """x_can of the given flat child slots (anchor * k + child), Eq. 4."""
-        owners = children // self.children
+        owners = children // self.slots
         scales = self.log_scales.exp().index_select(0, owners)
         return self.anchors.index_select(0, owners) + scales * self.offsets.flatten(0, 1).index_select(0, children)
 
     def child_uids(self, children: Int64[Tensor, " drawn"]) -> Int64[Tensor, " drawn"]:
         """Persistent birth numbers of the given flat child slots."""
-        owners = children // self.children
-        return self.uids.index_select(0, owners) * self.children + children % self.children
+        owners = children // self.slots
+        return self.uids.index_select(0, owners) * self.slots + children % self.slots

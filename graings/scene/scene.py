@@ -130,7 +130,7 @@ class Scene(nn.Module):
             return None
         moment = torch.tensor([time], dtype=canonical_means.dtype)
         positions = (canonical_means.detach() if self.config.stop_gradient else canonical_means) / self.extent
-        owners = children // self.scaffold.children
+        owners = children // self.scaffold.slots
         if self.single is not None:
             raw = self._single(self.single, children, positions, moment)[:, 7:]
         elif self.deformation is not None and self.config.deformation == "anchor":
@@ -143,7 +143,7 @@ class Scene(nn.Module):
         return deformation_from(raw, self.extent)
 
     def _single(self, single: SingleMLP, children: Tensor, positions: Tensor, moment: Tensor | None) -> Tensor:
-        k = self.scaffold.children
+        k = self.scaffold.slots
         offsets = self.scaffold.offsets.flatten(0, 1).index_select(0, children)
         raw: Tensor = single(self.scaffold.features, offsets, children // k, children % k, positions, moment)
         return raw
@@ -151,7 +151,7 @@ class Scene(nn.Module):
     def _canonical(self, children: Tensor) -> tuple[Tensor, Tensor]:
         """(quats, log_scales) of the drawn children before any deformation, Eq. 5."""
         scaffold = self.scaffold
-        owners, slots = children // scaffold.children, children % scaffold.children
+        owners, slots = children // scaffold.slots, children % scaffold.slots
         base = scaffold.log_scales.index_select(0, owners)
         if self.static is None:
             return identity_quaternion(base).expand(len(children), 4), base + math.log(INITIAL_SCALE)
@@ -169,5 +169,5 @@ class Scene(nn.Module):
         moment = torch.tensor([time], dtype=positions.dtype) if self.temporal else None
         raw = self._single(self.single, children, positions, moment)
         quats, relative = canonical_attributes(raw[:, :7])
-        base = self.scaffold.log_scales.index_select(0, children // self.scaffold.children)
+        base = self.scaffold.log_scales.index_select(0, children // self.scaffold.slots)
         return quats, base + relative, deformation_from(raw[:, 7:], self.extent) if self.temporal else None

@@ -145,7 +145,7 @@ def grow(
         if count == 0:
             continue
         member, chosen = place[member[inside]], chosen[inside]
-        owners = chosen // scaffold.children
+        owners = chosen // scaffold.slots
         features = torch.full((count, scaffold.features.shape[1]), -math.inf)
         features = features.scatter_reduce(
             0, member.unsqueeze(-1).expand(-1, features.shape[1]), scaffold.features.detach()[owners], "amax"
@@ -154,7 +154,7 @@ def grow(
         # The parent is the candidate with the largest gradient in the cell (lowest slot on a tie).
         parent = torch.full((count,), len(mean), dtype=torch.int64)
         best = mean[chosen] == score[member]
-        parent = parent.scatter_reduce(0, member[best], chosen[best], "amin") // scaffold.children
+        parent = parent.scatter_reduce(0, member[best], chosen[best], "amin") // scaffold.slots
         nodes = (cells[free].double() * cell).to(scaffold.anchors.dtype)
         fresh["anchors"].append(nodes)
         fresh["features"].append(features)
@@ -174,7 +174,7 @@ def grow(
             "uids": next_uid + torch.arange(len(order)),
             "log_scales": new["log_scales"][order],
             "features": new["features"][order],
-            "offsets": torch.zeros(len(order), scaffold.children, 3),
+            "offsets": torch.zeros(len(order), scaffold.slots, 3),
             "opacity_offsets": newborn_offsets(scaffold, logits, new["parent"][order], config.newborn_opacity),
         },
         capped=len(order) < len(new["score"]),

@@ -90,7 +90,7 @@ class Trainer:
         """Everything whose shape follows the scene."""
         scaffold = self.scene.scaffold
         self.optimizer = Optimizer(self.scene, self.config, joint_from=self.phases[-1].first - 1)
-        self.statistics = DensityStatistics(scaffold.count, scaffold.children)
+        self.statistics = DensityStatistics(scaffold.count, scaffold.slots)
         self.guard = Guard()
 
     def __iter__(self) -> Iterator[StepReport]:

@@ -16,13 +16,13 @@ VOXEL = 0.01
 
 
 def _grow(scaffold: Scaffold, statistics: DensityStatistics, **config: object) -> object:
-    logits = torch.ones(scaffold.count, scaffold.children) + scaffold.opacity_offsets.detach().unsqueeze(-1)
+    logits = torch.ones(scaffold.count, scaffold.slots) + scaffold.opacity_offsets.detach().unsqueeze(-1)
     generator = torch.Generator().manual_seed(0)
     return grow(scaffold, statistics, logits, DensityConfig(**config), VOXEL, 100, generator)
 
 
 def _busy(scaffold: Scaffold, gradient: float = 1.0, times: int = 50) -> DensityStatistics:
-    statistics = DensityStatistics(scaffold.count, scaffold.children)
+    statistics = DensityStatistics(scaffold.count, scaffold.slots)
     statistics.gradient.fill_(gradient * times)
     statistics.drawn.fill_(times)
     return statistics
