@@ -135,8 +135,11 @@ class Lpips:
         """The package `lpips` with its VGG backbone from `$TORCH_HOME`, or the reason why there is none."""
         try:
             import lpips  # optional extra [lpips]
-        except ImportError:
+        except ModuleNotFoundError:
             return Lpips(None, "the package lpips is not installed (pip install 'graings[lpips]')")
+        except (ImportError, RuntimeError) as error:
+            # A torchvision built for another torch fails like this; LPIPS is optional, the run is not.
+            return Lpips(None, f"the package lpips does not load: {error}")
         problem = _backbone_problem(Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE)
         if problem is not None:
             return Lpips(None, problem)
