@@ -1,0 +1,61 @@
+"""The command `worker`; also `python -m jobs.commands`. Knows nothing of how jobs are done."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jobs.job import JobError
+from jobs.parent import watch_parent
+from jobs.store import Store
+from jobs.worker import Worker
+
+DATABASE_FILE = "jobs.sqlite"
+
+
+def default_database(data: Path) -> str:
+    """The SQLite database in the data folder; it must lie on a local disk."""
+    return f"sqlite:///{data.resolve() / DATABASE_FILE}"
+
+
+def worker(
+    data: Annotated[Path, typer.Option(envvar="GRAINGS_DATA", help="Folder with captures and jobs.")] = Path("data"),
+    database: Annotated[
+        str | None,
+        typer.Option(
+            envvar="GRAINGS_DATABASE", help="sqlite:///… or postgresql://… (default: SQLite in the data folder)."
+        ),
+    ] = None,
+    slots: Annotated[
+        int, typer.Option(min=1, max=64, help="Jobs at a time; the worker started last decides for all.")
+    ] = 1,
+    threads: Annotated[
+        int | None, typer.Option(min=1, max=256, help="CPU threads per job (default: all / slots).")
+    ] = None,
+    exit_with_parent: Annotated[bool, typer.Option("--exit-with-parent", help="End when standard input ends.")] = False,
+) -> None:
+    """Take training jobs from the queue until interrupted. Running jobs are brought to a checkpoint then."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    if exit_with_parent:
+        watch_parent(stop.set)
+    store = Store(data)
+    chosen = threads or max(1, (os.cpu_count() or 1) // slots)
+    try:
+        Worker(store, database or default_database(store.root), slots=slots, threads=chosen).run(stop)
+    except JobError as error:
+        typer.echo(f"worker: {error}", err=True)
+        raise typer.Exit(1) from error
+
+
+if __name__ == "__main__":
+    typer.run(worker)

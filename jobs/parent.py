@@ -1,0 +1,23 @@
+"""Parent watch: notice that the process which started this one is gone.
+
+The parent keeps the other end of our standard input open; when it dies, however it dies, the kernel closes it. Knows
+nothing of what to do then.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+
+
+def watch_parent(on_death: Callable[[], None]) -> None:
+    """Call `on_death` from a thread once standard input ends."""
+
+    def watch() -> None:
+        # os.read and not sys.stdin: a thread inside a buffered reader aborts the interpreter when it exits.
+        while os.read(0, 1):
+            pass
+        on_death()
+
+    threading.Thread(target=watch, name="parent-watch", daemon=True).start()

@@ -1,0 +1,175 @@
+"""Store: captures and jobs on disk.
+
+    <root>/captures/<sha256>/    an unpacked capture, shared by all jobs that use it
+    <root>/jobs/<id>/            job.json, attempts.json, progress.jsonl, log.txt, lock, run/ (the trainer's own)
+    <root>/uploads/              archives on their way in
+    <root>/workers/              leases of workers on this machine
+
+Every file appears whole or not at all. The store knows nothing of queues: whether a job runs is not its concern.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from graings.checkpoint import newest_checkpoint
+from jobs.files import locked, write_json
+from jobs.job import Attempt, JobConflict, JobError, JobNotFound, JobSpec, check_id
+
+KEPT_ATTEMPTS = 50
+
+
+@dataclass(frozen=True, slots=True)
+class JobFolder:
+    """The files of one job."""
+
+    path: Path
+
+    @property
+    def run(self) -> Path:
+        return self.path / "run"
+
+    @property
+    def log(self) -> Path:
+        return self.path / "log.txt"
+
+    @property
+    def progress(self) -> Path:
+        return self.path / "progress.jsonl"
+
+    @property
+    def lock(self) -> Path:
+        return self.path / "lock"
+
+    @property
+    def metrics(self) -> Path:
+        return self.run / "metrics.json"
+
+    @property
+    def curve(self) -> Path:
+        return self.run / "curve.svg"
+
+    def spec(self) -> JobSpec:
+        return JobSpec(**self._record()["spec"])
+
+    def created_at(self) -> float:
+        return float(self._record()["created_at"])
+
+    def _record(self) -> dict[str, Any]:
+        try:
+            record: dict[str, Any] = json.loads((self.path / "job.json").read_text())
+        except FileNotFoundError as error:
+            raise JobNotFound(self.path.name) from error
+        except ValueError as error:
+            raise JobError(f"{self.path / 'job.json'}: not readable ({error}). Delete the job.") from error
+        return record
+
+    def checkpoint(self) -> int | None:
+        """The iteration of the newest checkpoint, or None."""
+        newest = newest_checkpoint(self.run)
+        return None if newest is None else int(newest.name)
+
+    def attempts(self) -> list[Attempt]:
+        """The last starts of the trainer, oldest first."""
+        try:
+            return [Attempt(**values) for values in json.loads((self.path / "attempts.json").read_text())]
+        except FileNotFoundError:
+            return []
+
+    def begin_attempt(self, worker: str) -> Attempt:
+        """Record a start, before it happens: a start that kills its worker counts too."""
+        attempts = self.attempts()
+        number = attempts[-1].number + 1 if attempts else 1
+        attempt = Attempt(number, worker, time.time(), self.checkpoint() or 0)
+        self._write_attempts([*attempts, attempt])
+        return attempt
+
+    def end_attempt(self, attempt: Attempt, exit_code: int, message: str | None = None) -> None:
+        """Record how an attempt ended."""
+        ended = replace(attempt, ended_at=time.time(), exit_code=exit_code, message=message)
+        self._write_attempts([ended if one.number == attempt.number else one for one in self.attempts()])
+
+    def close_attempts(self) -> None:
+        """The job has ended: what happened so far no longer counts against the attempts to come."""
+        self._write_attempts([replace(one, final=True) for one in self.attempts()])
+
+    def _write_attempts(self, attempts: list[Attempt]) -> None:
+        write_json(self.path / "attempts.json", [asdict(one) for one in attempts[-KEPT_ATTEMPTS:]])
+
+
+class Store:
+    """The folder that holds everything; see the module for its layout."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+        self._captures = self.root / "captures"
+        self._jobs = self.root / "jobs"
+        self.uploads = self.root / "uploads"
+        self.workers = self.root / "workers"
+        for folder in (self._captures, self._jobs, self.uploads, self.workers):
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def capture(self, digest: str) -> Path:
+        """Where the capture's files begin: below folders that hold nothing but one folder."""
+        folder = self._captures / digest
+        while True:
+            inside = list(folder.iterdir()) if folder.is_dir() else []
+            if len(inside) != 1 or not inside[0].is_dir():
+                return folder
+            folder = inside[0]
+
+    def create(self, spec: JobSpec, unpacked: Path) -> str:
+        """A new job whose capture lies in the folder `unpacked`, which is moved into the store. Returns its id."""
+        now = time.time()
+        job_id = f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
+        with self._changing():
+            capture = self._captures / spec.capture
+            if capture.exists():
+                shutil.rmtree(unpacked)
+            else:
+                unpacked.rename(capture)
+            # The record is written first and the folder renamed last: a folder in jobs/ always has its record.
+            part = self.uploads / f"{job_id}.job"
+            part.mkdir()
+            write_json(part / "job.json", {"id": job_id, "created_at": now, "spec": asdict(spec)})
+            part.rename(self._jobs / job_id)
+        return job_id
+
+    def folder(self, job_id: str) -> JobFolder:
+        """The files of a job. Raises `JobNotFound`."""
+        path = self._jobs / check_id(job_id)
+        if not path.is_dir():
+            raise JobNotFound(job_id)
+        return JobFolder(path)
+
+    def ids(self) -> list[str]:
+        """All jobs, newest first: ids begin with the time."""
+        return sorted(os.listdir(self._jobs), reverse=True)
+
+    def delete(self, job_id: str) -> None:
+        """Remove a job, and its capture when no other job uses it. Raises `JobConflict` while its trainer is at it."""
+        folder = self.folder(job_id)
+        with self._changing(), locked(folder.lock, wait=False) as free:
+            if not free:
+                raise JobConflict(f"Job {job_id} is still writing its checkpoint. Try again in a few seconds.")
+            digest = folder.spec().capture
+            bin_ = self.uploads / f"{job_id}.deleted"
+            folder.path.rename(bin_)
+            shutil.rmtree(bin_)
+            if all(self.folder(other).spec().capture != digest for other in self.ids()):
+                shutil.rmtree(self._captures / digest, ignore_errors=True)
+
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """One at a time adds or removes jobs and captures, whichever process it is in."""
+        with locked(self.root / "store.lock"):
+            yield

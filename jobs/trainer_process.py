@@ -1,0 +1,161 @@
+"""The child process that trains one job: `python -m jobs.trainer_process JOB_FOLDER --threads N`.
+
+A process of its own, so that it can have its own number of threads, give all its memory back, crash or be killed
+without taking its worker along. It continues from the newest checkpoint where there is one, appends its progress to
+the job's folder, and ends with an `ExitCode`; where that is an error, standard output is one JSON object with the
+message. SIGTERM, SIGINT or the end of its parent make it write a checkpoint and stop. The only module of this package
+that imports training. Knows nothing of queues.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from graings.config import TrainConfig
+from graings.errors import DivergedError, GraingsError
+from graings.training.run import StepReport, TrainingRun
+from jobs.exit_code import ExitCode
+from jobs.files import locked
+from jobs.parent import watch_parent
+from jobs.progress import ProgressWriter
+from jobs.store import JobFolder, Store
+
+REPORT_EVERY_S = 1.0
+LOG_EVERY_S = 15.0
+LOCK_WAIT_S = 60.0
+# The service renders on the same cores; whoever looks should not wait for training.
+NICENESS = 5
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Train and return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m jobs.trainer_process", description=__doc__)
+    parser.add_argument("folder", type=Path, help="the job's folder in the store")
+    parser.add_argument("--threads", type=int, required=True, help="CPU threads, at most")
+    arguments = parser.parse_args(argv)
+
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    watch_parent(stop.set)
+    os.nice(NICENESS)
+    folder = JobFolder(arguments.folder.resolve())
+    deadline = time.monotonic() + LOCK_WAIT_S
+    while not stop.is_set():
+        # An orphan of a worker that was killed may still be writing its last checkpoint: wait for it.
+        with locked(folder.lock, wait=False) as ours:
+            if ours:
+                return _guarded(folder, arguments.threads, stop)
+        if time.monotonic() > deadline:
+            return _end(ExitCode.BUSY, "Another process still trains in this job's folder.")
+        stop.wait(0.2)
+    return ExitCode.STOPPED
+
+
+def _guarded(folder: JobFolder, threads: int, stop: threading.Event) -> int:
+    """Train, and turn whatever goes wrong into an exit code and a message."""
+    try:
+        return _train(folder, threads, stop)
+    except DivergedError as error:
+        return _end(ExitCode.DIVERGED, str(error))
+    except GraingsError as error:
+        return _end(ExitCode.REFUSED, str(error))
+    except Exception as error:
+        # The last frame of the process: the traceback goes to the log, the sentence to whoever asked for the job.
+        traceback.print_exc()
+        return _end(ExitCode.CRASHED, f"{type(error).__name__}: {error}. The log has the traceback.")
+
+
+def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
+    spec = folder.spec()
+    config = TrainConfig.model_validate(spec.config)
+    threads = min(config.threads or threads, threads)
+    torch.set_num_threads(threads)
+    capture = Store(folder.path.parent.parent).capture(spec.capture)
+    checkpoint = folder.checkpoint()
+    attempt = len(folder.attempts())
+    progress = ProgressWriter(folder.progress)
+    beginning = {"iteration": checkpoint or 0, "iterations": config.iterations, "attempt": attempt}
+    progress.write({"phase": "loading", **beginning})
+    if checkpoint is None:
+        shutil.rmtree(folder.run, ignore_errors=True)  # what a start without a checkpoint left is worth nothing
+        run = TrainingRun.create(capture, folder.run, config.model_copy(update={"threads": threads}))
+    else:
+        run = TrainingRun.resume(folder.run, capture=capture, threads=threads)
+    _log(f"attempt {attempt}: {threads} threads, from iteration {checkpoint or 0} of {config.iterations}")
+
+    reported = logged = -LOG_EVERY_S
+    for report in run:
+        now = time.monotonic()
+        if now - reported >= REPORT_EVERY_S or report.evaluation or report.iteration == report.iterations:
+            progress.write({**_values(report), "attempt": attempt})
+            reported = now
+        if now - logged >= LOG_EVERY_S or report.evaluation or report.events:
+            _log(_line(report))
+            logged = now
+        if stop.is_set() and report.iteration < report.iterations:
+            path = run.save()
+            _log(f"stopped at iteration {report.iteration}, checkpoint {path.name}")
+            return ExitCode.STOPPED
+    _log("finished")
+    return ExitCode.DONE
+
+
+def _values(report: StepReport) -> dict[str, Any]:
+    speed = report.iterations_per_s
+    values: dict[str, Any] = {
+        "phase": report.phase,
+        "iteration": report.iteration,
+        "iterations": report.iterations,
+        "loss": report.loss,
+        "psnr": report.psnr,
+        "gaussians": report.gaussians,
+        "anchors": report.anchors,
+        "iterations_per_s": speed,
+        "eta_s": (report.iterations - report.iteration) / speed if speed > 0 else None,
+        "train_s": report.train_s,
+    }
+    if report.evaluation:
+        values |= {"held_out_psnr": report.evaluation.psnr, "held_out_ssim_3dgs": report.evaluation.ssim_3dgs}
+    return values
+
+
+def _line(report: StepReport) -> str:
+    line = (
+        f"{report.iteration}/{report.iterations} {report.phase}: loss {report.loss:.5f}, PSNR {report.psnr:.2f} dB, "
+        f"{report.gaussians} Gaussians, {report.anchors} anchors, {report.iterations_per_s:.1f} it/s"
+    )
+    if report.evaluation:
+        line += f"; held-out PSNR {report.evaluation.psnr:.2f} dB"
+    return "; ".join([line, *report.events])
+
+
+def _log(text: str) -> None:
+    """One dated line in the job's log, which is our standard error."""
+    print(time.strftime("%Y-%m-%dT%H:%M:%S%z"), text, file=sys.stderr, flush=True)
+
+
+def _end(code: ExitCode, message: str) -> int:
+    _log(message)
+    print(json.dumps({"error": message}), flush=True)
+    return code
+
+
+if __name__ == "__main__":
+    # No interpreter shutdown: the parent watch is inside a read, and everything is on disk.
+    status = main()
+    sys.stdout.flush()
+    os._exit(status)
