@@ -1,4 +1,4 @@
-"""Viewpoint: from what a person asks for to a camera.
+"""Viewpoint: from what a person asks for to a camera and a background.
 
 Requests come in the capture's own units, angles in degrees; the camera that goes out is normalised
 (`graings.units`). What is not asked for is taken from the training views. The command line and the service
@@ -20,7 +20,7 @@ from graings.units import Units
 def orbit_view(
     model_views: Sequence[View],
     units: Units,
-    azimuth: float = 0.0,
+    azimuth: float | None = None,
     elevation: float | None = None,
     radius: float | None = None,
     target: ArrayLike | None = None,
@@ -31,8 +31,8 @@ def orbit_view(
     """A camera on a sphere around `target`, looking at it.
 
     `azimuth` turns about the capture's vertical, `elevation` rises from the horizon, both in degrees; `radius`
-    and `target` [3] are in capture units, `fov` is the full horizontal angle in degrees. Left out, they are the
-    median radius and elevation of `model_views`, the scene's centre, and the first view's angle and size.
+    and `target` [3] are in capture units, `fov` is the full horizontal angle in degrees. Left out, they are azimuth
+    0, the median radius and elevation of `model_views`, the scene's centre, and the first view's angle and size.
     Raises `ValueError` naming the parameter.
     """
     if not model_views:
@@ -48,6 +48,7 @@ def orbit_view(
         # A camera that sits exactly on the target has no direction; it counts as level.
         sines = arms @ up / np.where(lengths > 0, lengths, 1.0)
         elevation = math.degrees(float(np.median(np.arcsin(np.clip(sines, -1.0, 1.0)))))
+    azimuth = 0.0 if azimuth is None else azimuth
     first = model_views[0].camera
     fov = math.degrees(first.horizontal_fov) if fov is None else fov
     for name, value in (("azimuth", azimuth), ("elevation", elevation), ("radius", radius), ("fov", fov)):
@@ -107,6 +108,21 @@ def sized(camera: Camera, width: int | None = None, height: int | None = None) -
     cy = 0.5 * height_ + zoom * (camera.cy - 0.5 * camera.height)
     pose = camera.world_to_camera
     return Camera(pose, zoom * camera.fx, zoom * camera.fy, zoom * camera.cx, cy, width_, height_)
+
+
+def background_rgb(text: str) -> tuple[float, float, float]:
+    """A background from `white`, `black`, `#rrggbb` or three numbers in [0, 1] such as `0.5,0.5,0.5`."""
+    named = {"white": "#ffffff", "black": "#000000"}.get(text.strip().lower(), text.strip())
+    try:
+        if named.startswith("#") and len(named) == 7:
+            values = [byte / 255.0 for byte in bytes.fromhex(named[1:])]
+        else:
+            values = [float(part) for part in named.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(0.0 <= value <= 1.0 for value in values):
+        raise ValueError(f"background must be white, black, #rrggbb or r,g,b in [0, 1], got {text!r}")
+    return values[0], values[1], values[2]
 
 
 def _size(camera: Camera, width: int | None, height: int | None) -> tuple[int, int]:

@@ -7,7 +7,7 @@ import pytest
 
 from graings.camera import Camera, View
 from graings.units import Units
-from graings.viewpoint import named_view, orbit_view, pose_camera, sized
+from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
 
 UNITS = Units(center=(1.0, -2.0, 3.0), scale=0.25)
 
@@ -115,3 +115,22 @@ def test_a_pose_in_capture_units_sees_the_same_pixels_after_normalising() -> Non
 def test_a_pose_of_the_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"\(4, 4\)"):
         pose_camera(UNITS, np.eye(3), 50.0, 50.0, 20.0, 15.0, 40, 30)
+
+
+@pytest.mark.parametrize(
+    ("text", "color"),
+    [
+        ("white", (1.0, 1.0, 1.0)),
+        (" Black ", (0.0, 0.0, 0.0)),
+        ("#ff0033", (1.0, 0.0, 0.2)),
+        ("0.25, 0.5,1", (0.25, 0.5, 1.0)),
+    ],
+)
+def test_a_background_is_a_name_a_hex_code_or_three_numbers(text: str, color: tuple[float, float, float]) -> None:
+    assert background_rgb(text) == color
+
+
+@pytest.mark.parametrize("text", ["", "pink", "#fff", "#gg0000", "#+1+2+3", "1,1", "0,0,2", "nan,0,0", "0,0,0,0"])
+def test_anything_else_is_no_background(text: str) -> None:
+    with pytest.raises(ValueError, match="background must be white"):
+        background_rgb(text)

@@ -1,0 +1,291 @@
+"""The command line: one verb per thing a person wants done.
+
+Reads arguments, calls the library, prints, and turns errors into one line and an exit code. Verbs that need jobs
+or HTTP live in those packages and join through the entry-point group `graings.commands`; this module does not
+know their names.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, NoReturn
+
+import typer
+import typer.core
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from graings.camera import Camera
+from graings.checkpoint import Model, load_model
+from graings.config import PRESETS, Part, make_config, options
+from graings.encode import encode_image, image_format
+from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
+from graings.evaluation import evaluate_run
+from graings.interrupt import Interrupt
+from graings.progress import TrainingProgress
+from graings.render import render
+from graings.report import read_metrics
+from graings.training.run import TrainingRun
+from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
+
+MISSING: Final = 69
+EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (
+    (ConfigError, 2),
+    (CaptureError, 65),
+    (CheckpointError, 65),
+    (KernelError, MISSING),
+    (DivergedError, 70),
+    (OSError, 74),
+)
+EPILOG: Final = (
+    "Exit codes: 0 done; 1 a bug; 2 wrong usage or option; 65 the capture or checkpoint cannot be used; 69 the kernel "
+    "or a package is missing; 70 training diverged; 74 a file cannot be read or written; 130 interrupted (143 by "
+    "SIGTERM), for training with a checkpoint to resume from."
+)
+
+Threads = Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads; left out: all cores.")]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or one of its checkpoints.")]
+
+
+class Verbs(typer.core.TyperGroup):
+    """The verbs below and those of other installed packages, which are loaded when they are used."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names in the order of the help page."""
+        return [*super().list_commands(ctx), *sorted(entry_points(group="graings.commands").names)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command of that name, or None."""
+        for entry in entry_points(group="graings.commands", name=cmd_name):
+            return _joined(entry)
+        return super().get_command(ctx, cmd_name)
+
+
+app = typer.Typer(cls=Verbs, no_args_is_help=True, add_completion=False, epilog=EPILOG, pretty_exceptions_enable=False)
+
+
+@app.callback()
+def graings() -> None:
+    """See a moving scene from anywhere, at any time, with nothing but a CPU."""
+
+
+@app.command()
+def train(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the run.")],
+    capture: Annotated[Path | None, typer.Argument(help="Folder of the capture; optional with --resume.")] = None,
+    preset: Annotated[str | None, typer.Option(help=f"Where defaults come from: {', '.join(PRESETS)}.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any option of `graings options`.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue RUN from its newest checkpoint.")] = False,
+    threads: Threads = None,
+) -> None:
+    """Train a model on a capture."""
+    if resume:
+        if preset is not None or settings:
+            raise typer.BadParameter("a resumed run keeps its options; leave out --preset and --set")
+        run = TrainingRun.resume(output, capture=capture, threads=threads)
+    else:
+        if capture is None:
+            raise typer.BadParameter("say which capture to train on", param_hint="CAPTURE")
+        overrides = dict(_setting(text) for text in settings or ())
+        if preset is not None:
+            overrides["preset"] = preset
+        if threads is not None:
+            overrides["threads"] = threads
+        run = TrainingRun.create(capture, output, make_config(overrides=overrides))
+    _train(run)
+
+
+def _train(run: TrainingRun) -> None:
+    with (
+        TrainingProgress(Console(), run.iteration, run.iterations) as progress,
+        Interrupt(lambda: progress.note("stopping after this step; once more to stop at once")) as interrupt,
+    ):
+        for note in run.capture.notes:
+            progress.note(note)
+        for step in run:
+            progress.show(step)
+            if interrupt.received is not None and step.iteration < run.iterations:
+                run.save()
+                break
+    if run.iteration < run.iterations:
+        _say(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations; nothing is lost.")
+        _say(f"Continue with: graings train --resume -o {run.folder}")
+        raise typer.Exit(interrupt.exit_code)
+    for split, metrics in read_metrics(run.metrics_path)["splits"].items():
+        _say_metrics(split, metrics)
+    _say(f"The model, metrics.json and curve.svg are in {run.folder}.")
+    _say(f"Look at it: graings render {run.folder} --t 0.5 -o view.png")
+
+
+@app.command(name="render")
+def render_view(
+    run: Run,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Image file: .png, .jpg, .webp or .exr.")],
+    t: Annotated[float | None, typer.Option(help="Time from 0 to 1; left out: that of --camera, or 0.")] = None,
+    camera: Annotated[str | None, typer.Option(help="A view of the capture, such as test:3.")] = None,
+    azimuth: Annotated[float | None, typer.Option(help="Degrees about the vertical axis.")] = None,
+    elevation: Annotated[float | None, typer.Option(help="Degrees above the horizon.")] = None,
+    radius: Annotated[float | None, typer.Option(help="Distance to the target in the capture's units.")] = None,
+    target: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="What to look at, in the capture's units."),
+    ] = None,
+    fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
+    pose: Annotated[
+        Path | None, typer.Option(help="JSON: world_to_camera (4x4, OpenCV axes), fx, fy, cx, cy, width, height.")
+    ] = None,
+    width: Annotated[int | None, typer.Option(min=1, max=16384, help="Pixels.")] = None,
+    height: Annotated[int | None, typer.Option(min=1, max=16384, help="Pixels.")] = None,
+    background: Annotated[
+        str | None, typer.Option(help="white, black, #rrggbb or r,g,b; left out: as trained.")
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Draw one view at one time; without a camera, an orbit at the height of the training views."""
+    orbit = any(value is not None for value in (azimuth, elevation, radius, target, fov))
+    if (camera is not None) + (pose is not None) + orbit > 1:
+        raise typer.BadParameter("choose one of --camera, --pose and an orbit (--azimuth, --elevation, ...)")
+    if t is not None and not math.isfinite(t):
+        raise typer.BadParameter(f"time must be a number from 0 to 1, got {t}", param_hint="--t")
+    try:
+        format = image_format(output.suffix)
+        rgb = background_rgb(background) if background is not None else None
+        model = load_model(run)
+        if camera is not None:
+            named = named_view(model.views, camera)
+            view, own_time = sized(named.camera, width, height), named.time
+        elif pose is not None:
+            view, own_time = sized(_read_pose(pose, model), width, height), 0.0
+        else:
+            around = model.views["train"]
+            view = orbit_view(around, model.units, azimuth, elevation, radius, target, fov, width, height)
+            own_time = 0.0
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    moment = own_time if t is None else min(max(t, 0.0), 1.0)
+    if t is not None and moment != t:
+        _say(f"Time {t:g} lies outside the capture; drawn at {moment:g}.")
+    started = time.perf_counter()
+    result = render(model.scene, view, moment, rgb or model.background, threads=threads)
+    milliseconds = 1e3 * (time.perf_counter() - started)
+    output.write_bytes(encode_image(result.color.numpy(), format))
+    _say(f"{output}: {view.width} x {view.height} at t = {moment:g}, drawn in {milliseconds:.0f} ms.")
+
+
+@app.command()
+def evaluate(
+    run: Run,
+    split: Annotated[Literal["val", "test"], typer.Option(help="Held-out views to measure.")] = "val",
+    capture: Annotated[Path | None, typer.Option(help="Where the capture lies now, if it moved.")] = None,
+    threads: Threads = None,
+) -> None:
+    """Measure a trained model on held-out views and add the numbers to its metrics.json."""
+    _say_metrics(split, evaluate_run(run, split, capture, threads=threads).to_json())
+    _say(f"Written to {run / 'metrics.json'}.")
+
+
+@app.command(name="options")
+def show_options(
+    preset: Annotated[str, typer.Option(help="Show the values of this preset.")] = "standard",
+    as_json: Annotated[bool, typer.Option("--json", help="JSON schema and presets instead of a table.")] = False,
+) -> None:
+    """List every option that --set understands."""
+    console = Console()
+    if as_json:
+        console.print_json(json.dumps(options()))
+        return
+    table = Table("option", "value", "bounds", "", box=None, pad_edge=False, header_style="bold")
+    for name, value, bounds, text in _fields(make_config(preset)):
+        table.add_row(Text(name), Text(value, style="cyan"), Text(bounds, style="dim"), Text(text))
+    console.print(table)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and exit."""
+    try:
+        app(args=arguments, prog_name="graings")
+    except (GraingsError, OSError) as error:
+        _fail(str(error), next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1))
+
+
+def _joined(entry: EntryPoint) -> Any:
+    """The command of an entry point; where it cannot be loaded, one that says why when it is used."""
+    one = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    try:
+        one.command(entry.name)(entry.load())
+    except ImportError as error:
+        reason = str(error)
+
+        def missing() -> None:
+            _fail(f"graings {entry.name} is not available here: {reason}. Install what is missing.", MISSING)
+
+        anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+        one.command(entry.name, help=f"(not available: {reason})", context_settings=anything)(missing)
+    return typer.main.get_command(one)
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """`key=value` with the value as JSON, or as a string where it is none."""
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise typer.BadParameter(f"must look like key=value, got {text!r}", param_hint="--set")
+    try:
+        return key, json.loads(value)
+    except ValueError:
+        return key, value
+
+
+def _read_pose(file: Path, model: Model) -> Camera:
+    """The camera in a pose file; `ValueError` naming the key that is missing or wrong."""
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{file}: not JSON ({error})") from error
+    keys = ("world_to_camera", "fx", "fy", "cx", "cy", "width", "height")
+    absent = [key for key in keys if key not in document] if isinstance(document, dict) else list(keys)
+    if absent:
+        raise ValueError(f"{file}: {', '.join(absent)} missing; a pose needs {', '.join(keys)}")
+    try:
+        return pose_camera(model.units, *(document[key] for key in keys))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def _fields(part: Part, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
+    """Name, value, bounds and help of every option below `part`."""
+    for name, field in type(part).model_fields.items():
+        value = getattr(part, name)
+        if isinstance(value, Part):
+            yield from _fields(value, f"{prefix}{name}.")
+            continue
+        signs = (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<"))
+        bounds = [f"{sign} {getattr(m, key)}" for m in field.metadata for key, sign in signs if hasattr(m, key)]
+        yield f"{prefix}{name}", json.dumps(value), ", ".join(bounds), field.description or ""
+
+
+def _say_metrics(split: str, metrics: Mapping[str, Any]) -> None:
+    if metrics["psnr"] is None:
+        _say(f"{split}: {metrics['reason']}")
+        return
+    lpips = metrics["lpips_vgg"]
+    rest = f"LPIPS {lpips:.4f}" if lpips is not None else f"no LPIPS: {metrics['lpips_reason']}"
+    views = len(metrics["views"])
+    _say(f"{split}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim_3dgs']:.4f}, {views} views; {rest}")
+
+
+def _say(text: str) -> None:
+    Console().print(Text(text), soft_wrap=True)
+
+
+def _fail(text: str, code: int) -> NoReturn:
+    Console(stderr=True).print(Text(text, style="red"), soft_wrap=True)
+    sys.exit(code)
