@@ -31,7 +31,7 @@ CARVING_VIEWS = 60
 MASK_MARGIN = 2
 
 # With fewer carved points than this the vote has failed (masks that never overlap) and is not used.
-MIN_CARVED = 500
+MIN_CARVED = 100
 
 NEIGHBOURS = 3
 
