@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graings.camera import Camera, View
+from graings.capture.lens import Lens
 from graings.units import Units
 
 Split = Literal["train", "val", "test"]
@@ -30,6 +31,7 @@ class Frame:
     time: float  # normalised to [0, 1]
     image_path: Path
     source_size: tuple[int, int]  # width, height of the file in pixels
+    lens: Lens | None = None  # how to undistort the file; None: it is a pinhole picture already
 
     def view(self) -> View:
         """The frame without its image."""

@@ -1,0 +1,88 @@
+"""CaptureFolder: the only door through which readers reach files of a capture.
+
+It refuses every path that leads outside, checks that images are whole, and remembers what was read, so that
+the capture gets a hash that does not depend on where it lies. Knows nothing of cameras, times or splits.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from graings.capture.image_file import SUFFIXES, ImageFile, check_image
+from graings.errors import CaptureError
+
+
+class CaptureFolder:
+    """A capture on disk. All names are relative to `root`, with forward slashes."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+        self._digests: dict[str, str] = {}
+        self._images: dict[str, ImageFile] = {}
+
+    def locate(self, name: str, *, source: str, field: str | None = None) -> Path:
+        """The path of `name`, whether it exists or not; `source` and `field` say who asked for it.
+
+        Raises `CaptureError` where the name, or a link on its way, leads outside the capture.
+        """
+        try:
+            path = self.root / name
+            outside = Path(name).is_absolute() or not path.resolve().is_relative_to(self.root)
+        except (OSError, ValueError, RuntimeError) as error:  # a NUL byte, a name too long, a loop of links
+            raise CaptureError(
+                f"cannot use the path {name[:200]!r} ({error})", file=source, field=field, remedy="Give a plain path."
+            ) from error
+        if outside:
+            raise CaptureError(
+                f"the path {name!r} leads outside the capture",
+                file=source,
+                field=field,
+                remedy="Use paths relative to the capture folder and put the files themselves into it, not links.",
+            )
+        return path
+
+    def has(self, name: str) -> bool:
+        """Whether `name` is a regular file of the capture."""
+        return self.locate(name, source=name).is_file()
+
+    def read(self, name: str) -> bytes:
+        """Contents of a file, which then counts towards `digest`."""
+        path = self.locate(name, source=name)
+        try:
+            if not path.is_file():
+                raise CaptureError("is missing or not a regular file", file=name, remedy="Add it to the capture.")
+            data = path.read_bytes()
+        except OSError as error:
+            raise CaptureError(
+                f"cannot be read ({error.strerror})", file=name, remedy="Check the file and its permissions."
+            ) from error
+        self._digests[name] = hashlib.sha256(data).hexdigest()
+        return data
+
+    def image(self, name: str, *, source: str, field: str | None = None) -> ImageFile:
+        """The image `name`, which may lack its extension; checked to be whole, not decoded.
+
+        Raises `CaptureError` where it is missing, truncated, too large or in no format that is read.
+        """
+        candidates = [name, *(name + suffix for suffix in SUFFIXES)]
+        for candidate in candidates:
+            path = self.locate(candidate, source=source, field=field)
+            if path.is_file():
+                relative = path.relative_to(self.root).as_posix()
+                if ".." in Path(relative).parts:
+                    relative = path.resolve().relative_to(self.root).as_posix()
+                if relative not in self._images:
+                    self._images[relative] = check_image(path, relative, self.read(relative))
+                return self._images[relative]
+        raise CaptureError(
+            f"the image {name!r} is missing (tried as it is and with {', '.join(SUFFIXES)})",
+            file=source,
+            field=field,
+            remedy="Add the image or take its entry out.",
+        )
+
+    def digest(self) -> str:
+        """sha256 over names and contents of every file read so far."""
+        lines = (f"{digest} {name}\n" for name, digest in sorted(self._digests.items()))
+        return hashlib.sha256("".join(lines).encode()).hexdigest()

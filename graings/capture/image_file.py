@@ -1,0 +1,167 @@
+"""ImageFile: one image on disk: is it whole, how large is it, what are its pixels.
+
+PNG, JPEG and OpenEXR, told apart by content, not by name. Stored values are taken as they are: 8 bit as x/255,
+16 bit as x/65535, EXR floats clipped to [0, 1] with no transfer curve. Knows nothing of cameras or sizes wanted.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from graings.errors import CaptureError
+
+SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
+
+# A few kilobytes of PNG can announce any size: more than this is refused before anything is decoded.
+MAX_SIDE: Final = 16384
+MAX_PIXELS: Final = 2**26  # 1 GB as RGBA float32
+
+PNG: Final = b"\x89PNG\r\n\x1a\n"
+JPEG: Final = b"\xff\xd8\xff"
+EXR: Final = b"\x76\x2f\x31\x01"
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFile:
+    """A checked image; `name` is relative to the capture."""
+
+    path: Path
+    name: str
+    width: int
+    height: int
+    has_alpha: bool
+
+
+def check_image(path: Path, name: str, data: bytes) -> ImageFile:
+    """Header of the image at `path` whose contents are `data`.
+
+    PNG chunks and JPEG segments are walked to their end mark (decoders fill a truncated JPEG with grey and say
+    nothing); EXR has no end mark and is decoded once. Raises `CaptureError` for anything that is not whole.
+    """
+    if data.startswith(PNG):
+        whole = _png_is_whole(data)
+    elif data.startswith(JPEG):
+        whole = _jpeg_is_whole(data)
+    elif data.startswith(EXR):
+        whole = True
+    elif not data:
+        whole = False
+    else:
+        raise CaptureError("is no PNG, JPEG or OpenEXR image", file=name, remedy="Convert it to one of these.")
+    if not whole:
+        raise _broken(name, "is truncated or damaged")
+    source = _open(path, name)
+    spec = source.spec()
+    source.close()
+    image = ImageFile(path, name, spec.width, spec.height, _channels(spec, name)[1] is not None)
+    if data.startswith(EXR):
+        decode(path, name)
+    return image
+
+
+def decode(path: Path, name: str) -> NDArray[np.float32]:
+    """Pixels [H, W, 3] or, where there is an alpha channel, [H, W, 4] premultiplied; float32 in [0, 1].
+
+    Raises `CaptureError` where the file cannot be decoded or holds a value that is not finite.
+    """
+    source = _open(path, name)
+    spec = source.spec()
+    color, alpha = _channels(spec, name)
+    stored = source.read_image(0, 0, 0, spec.nchannels, spec.format)
+    problem = source.geterror()
+    premultiplied = source.format_name() == "openexr"  # by its standard; PNG alpha is straight
+    source.close()
+    if stored is None or problem:
+        raise _broken(name, f"cannot be decoded ({' '.join(problem.split())})")
+    stored = np.asarray(stored).reshape(spec.height, spec.width, spec.nchannels)
+    pixels = stored[..., color if alpha is None else [*color, alpha]].astype(np.float32)
+    if np.issubdtype(stored.dtype, np.integer):
+        pixels /= np.float32(np.iinfo(stored.dtype).max)
+    elif not np.isfinite(pixels).all():
+        raise CaptureError("holds values that are not finite", file=name, remedy="Export the image again.")
+    else:
+        np.clip(pixels, 0.0, 1.0, out=pixels)
+    if alpha is not None and not premultiplied:
+        pixels[..., :3] *= pixels[..., 3:]
+    return pixels
+
+
+def _open(path: Path, name: str) -> oiio.ImageInput:
+    # OpenImageIO premultiplies PNG colours in 8 bit unless told not to, which loses the dark ones.
+    wanted = oiio.ImageSpec()
+    wanted["oiio:UnassociatedAlpha"] = 1
+    source = oiio.ImageInput.open(str(path), wanted)
+    if source is None:
+        raise _broken(name, f"cannot be opened ({' '.join(oiio.geterror().split())})")
+    spec = source.spec()
+    if max(spec.width, spec.height) > MAX_SIDE or spec.width * spec.height > MAX_PIXELS:
+        raise CaptureError(
+            f"is {spec.width}x{spec.height} px; at most {MAX_SIDE} px a side and {MAX_PIXELS} px in all are read",
+            file=name,
+            field="size",
+            remedy="Scale the images down.",
+        )
+    if spec.deep or spec.depth != 1:
+        raise CaptureError("is a deep or volume image", file=name, remedy="Flatten it.")
+    if (spec.x, spec.y, spec.full_width, spec.full_height) != (0, 0, spec.width, spec.height):
+        raise CaptureError(
+            "stores a part of its frame only (data window differs from display window)",
+            file=name,
+            field="size",
+            remedy="Export the full frame.",
+        )
+    return source
+
+
+def _channels(spec: oiio.ImageSpec, name: str) -> tuple[list[int], int | None]:
+    """Indices of the three colour channels (grey three times) and of alpha, or None."""
+    names = list(spec.channelnames)
+    alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
+    if {"R", "G", "B"} <= set(names):
+        return [names.index(c) for c in "RGB"], alpha
+    if len(names) - (alpha is not None) == 1:
+        return [int(alpha == 0)] * 3, alpha
+    raise CaptureError(
+        f"has the channels {', '.join(names)}",
+        file=name,
+        field="channels",
+        remedy="Grey or RGB, with or without alpha, are read.",
+    )
+
+
+def _png_is_whole(data: bytes) -> bool:
+    at = len(PNG)
+    view = memoryview(data)
+    while at + 12 <= len(data):
+        size = int.from_bytes(view[at : at + 4], "big")
+        kind, end = bytes(view[at + 4 : at + 8]), at + 12 + size
+        if end > len(data) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
+            return False
+        if kind == b"IEND":
+            return True
+        at = end
+    return False
+
+
+def _jpeg_is_whole(data: bytes) -> bool:
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] == 0xFF:  # fill byte
+            at += 1
+            continue
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[at + 1] == 0xDA:  # start of scan: coded data holds no bare marker, so the first end mark is the end
+            return data.find(b"\xff\xd9", end) >= 0
+        at = end
+    return False
+
+
+def _broken(name: str, problem: str) -> CaptureError:
+    return CaptureError(problem, file=name, remedy="Copy or export the image again.")

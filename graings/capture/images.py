@@ -1,0 +1,115 @@
+"""ImageStore: pixels of frames, decoded when asked for, kept in a bounded cache.
+
+Decode, undistort, shrink by exact area average on premultiplied alpha, composite on the background. Knows nothing of
+splits, poses or training.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graings.capture.capture import Frame
+from graings.capture.image_file import decode
+from graings.errors import CaptureError
+
+Image = NDArray[np.float32]
+Key = tuple[Path, int, int, str]
+
+
+class ImageStore:
+    """Images of a capture on one background; safe to share between threads.
+
+    Returned arrays are those in the cache: read them, do not write.
+    """
+
+    def __init__(self, background: Sequence[float], cache_mb: int = 1024) -> None:
+        self._background = np.asarray(background, dtype=np.float32).reshape(3)
+        self._limit = cache_mb * 1_000_000
+        self._lock = threading.Lock()
+        self._cache: OrderedDict[Key, Image | None] = OrderedDict()
+        self._bytes = 0
+
+    def rgb(self, frame: Frame) -> Image:
+        """Colour [H, W, 3] in [0, 1] on the background, at the size of the frame's camera.
+
+        Raises `CaptureError` where the file has changed or broken since the capture was loaded.
+        """
+        image = self._get(frame, "rgb")
+        assert image is not None  # only alpha may be absent
+        return image
+
+    def alpha(self, frame: Frame) -> Image | None:
+        """Coverage [H, W] in [0, 1] at the size of the frame's camera; None where the file has no alpha channel."""
+        return self._get(frame, "alpha")
+
+    @property
+    def cached_bytes(self) -> int:
+        """Memory the cached arrays take."""
+        return self._bytes
+
+    def _get(self, frame: Frame, part: str) -> Image | None:
+        key = (frame.image_path, frame.camera.width, frame.camera.height, part)
+        with self._lock:
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+        # Outside the lock: threads decode side by side; two asking for the same frame do the work twice, rarely.
+        rgb, alpha = self._load(frame)
+        with self._lock:
+            self._keep((*key[:3], "alpha"), alpha)
+            self._keep((*key[:3], "rgb"), rgb)
+        return rgb if part == "rgb" else alpha
+
+    def _keep(self, key: Key, image: Image | None) -> None:
+        if key in self._cache:
+            return
+        self._cache[key] = image
+        self._bytes += 0 if image is None else image.nbytes
+        while self._bytes > self._limit and self._cache:
+            _, dropped = self._cache.popitem(last=False)
+            self._bytes -= 0 if dropped is None else dropped.nbytes
+
+    def _load(self, frame: Frame) -> tuple[Image, Image | None]:
+        pixels = decode(frame.image_path, frame.name)
+        if (pixels.shape[1], pixels.shape[0]) != frame.source_size:
+            raise CaptureError(
+                f"is {pixels.shape[1]}x{pixels.shape[0]} px, was {frame.source_size[0]}x{frame.source_size[1]} before",
+                file=frame.name,
+                field="size",
+                remedy="Load the capture again.",
+            )
+        if frame.lens is not None:
+            pixels = frame.lens.undistort(pixels)
+        pixels = shrink(pixels, frame.camera.width, frame.camera.height)
+        if pixels.shape[2] == 3:
+            return np.ascontiguousarray(pixels), None
+        alpha = np.ascontiguousarray(pixels[..., 3])
+        rgb = pixels[..., :3] + self._background * (1.0 - alpha)[..., None]
+        return np.minimum(rgb, np.float32(1.0)), alpha
+
+
+def shrink(image: Image, width: int, height: int) -> Image:
+    """`image` [H, W, C] averaged over the areas of `height` x `width` equal cells, whatever the ratio."""
+    if image.shape[:2] == (height, width):
+        return image
+    return _cell_means(_cell_means(image, height, 0), width, 1).astype(np.float32)
+
+
+def _cell_means(values: NDArray[np.floating], cells: int, axis: int) -> NDArray[np.float64]:
+    # The integral of a row of pixels is piecewise linear: its differences at the cells' edges are exact sums.
+    size = values.shape[axis]
+    rows = np.moveaxis(values, axis, 0).astype(np.float64)
+    if cells == size:
+        return np.moveaxis(rows, 0, axis)
+    integral = np.concatenate([np.zeros_like(rows[:1]), np.cumsum(rows, axis=0)])
+    edges = np.arange(cells + 1) * size / cells
+    below = np.minimum(edges.astype(np.intp), size - 1)
+    part = (edges - below).reshape(-1, *([1] * (rows.ndim - 1)))
+    means = np.diff(integral[below] + part * rows[below], axis=0) * (cells / size)
+    return np.moveaxis(means, 0, axis)

@@ -1,0 +1,30 @@
+"""JSON documents of a capture: parsed and checked by a pydantic type, failures said in the capture's terms.
+
+Knows nothing of what the documents mean.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from graings.errors import CaptureError
+
+T = TypeVar("T")
+
+
+def parse_json(kind: TypeAdapter[T], data: bytes, file: str) -> T:
+    """`data` as `kind`. Raises `CaptureError` with the first field that does not fit."""
+    try:
+        return kind.validate_json(data.removeprefix(b"\xef\xbb\xbf"))
+    except ValidationError as error:
+        problems = error.errors(include_url=False, include_input=False, include_context=False)
+        first = problems[0]
+        field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+        problem = "the key is missing" if first["type"] == "missing" else first["msg"][0].lower() + first["msg"][1:]
+        if len(problems) > 1:
+            problem += f" (and {len(problems) - 1} more)"
+        raise CaptureError(
+            problem, file=file, field=field or None, remedy="Correct it or export the capture again."
+        ) from error

@@ -1,0 +1,38 @@
+"""Recording: what a reader found, in the capture's own lengths and times.
+
+Plain data between the readers and `graings.capture.normalize`. Knows nothing of either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graings.camera import Camera
+from graings.capture.capture import Split
+from graings.capture.image_file import ImageFile
+from graings.capture.lens import Lens
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """One image as it was taken. `camera` has the capture's length unit and the undistorted picture's full size."""
+
+    image: ImageFile
+    camera: Camera
+    time: float | None  # None: the capture says nothing of time
+    lens: Lens | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """All shots of a capture; `positions` [M, 3] in the capture's unit with `colors` [M, 3] in [0, 1]."""
+
+    kind: Literal["transforms", "colmap"]
+    splits: dict[Split, tuple[Shot, ...]]
+    notes: tuple[str, ...] = ()
+    positions: NDArray[np.float64] | None = None
+    colors: NDArray[np.float32] | None = None
