@@ -15,6 +15,8 @@ import numpy as np
 import torch
 
 import graings
+from graings.errors import KernelError
+from graings.raster.kernel import active_isa
 
 
 def machine_facts(threads: int | None = None) -> dict[str, Any]:
@@ -28,6 +30,7 @@ def machine_facts(threads: int | None = None) -> dict[str, Any]:
         "ram_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
         "os": f"{platform.system()} {platform.release()}",
         "architecture": platform.machine(),
+        "kernel_isa": _kernel_isa(),
         "torch_cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "threads": threads if threads is not None else torch.get_num_threads(),
     }
@@ -42,6 +45,14 @@ def version_facts() -> dict[str, Any]:
         "numpy": np.__version__,
         "commit": _commit(Path(__file__).resolve().parent.parent),
     }
+
+
+def _kernel_isa() -> str | None:
+    """Instruction set of the compiled kernel, or None where only the oracle can draw."""
+    try:
+        return active_isa()
+    except KernelError:
+        return None
 
 
 def _cpu_model() -> str:
