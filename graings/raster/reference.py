@@ -189,7 +189,7 @@ def _touches_image(prints: _Footprints, opacities: Tensor, camera: Camera, setti
     if settings.compat:
         first, last = _tile_range(prints, radii)
         tiles = (size / TILE).ceil()
-        return ((first.clamp(min=0) < torch.minimum(last, tiles))).all(1)
+        return (first.clamp(min=0) < torch.minimum(last, tiles)).all(1)
     low, high = prints.means2d - radii, prints.means2d + radii
     return ((low <= size + 0.5) & (high >= -0.5)).all(1)
 

@@ -1,0 +1,67 @@
+// One drawn view: runs the stages of the forward pass and keeps what the gradient needs.
+#pragma once
+#include <cstdlib>
+#include <memory>
+#include <vector>
+#include "types.hpp"
+
+namespace graings {
+
+// An array without initialisation, aligned to a cache line.
+template <class T>
+class Buffer {
+public:
+    Buffer() = default;
+    explicit Buffer(size_t count);
+    T* get() const { return data_.get(); }
+    T& operator[](size_t i) const { return data_.get()[i]; }
+
+private:
+    struct Free { void operator()(void* p) const { std::free(p); } };
+    std::unique_ptr<T, Free> data_;
+};
+
+template <class R>
+struct Outputs {
+    R *color, *alpha, *depth, *means2d, *radii;
+};
+
+template <class R>
+struct Gradients {
+    R *means, *quats, *log_scales, *opacities, *colors, *background, *offset;  // offset may be null
+};
+
+template <class R>
+class Frame {
+public:
+    // `uids` break ties of depth. Keeps no pointer into `in` or `out`.
+    Frame(const Camera&, const Settings&, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads);
+
+    // `in` must hold the same values as in the forward pass. v_alpha, v_depth may be null.
+    void gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha, const R* v_depth, const Gradients<R>& out, int threads) const;
+
+    const int64_t* statuses() const { return statuses_; }
+    int64_t pairs() const { return pairs_; }
+
+private:
+    std::vector<uint32_t> sorted(const double* depths, const int64_t* uids);
+    void bin(const std::vector<uint32_t>& order, const R* radii, int threads);
+    TileArgs<R> tile_args(const R* background) const;
+
+    Camera camera_;
+    Settings settings_;
+    int64_t count_, tiles_, pairs_ = 0;
+    int64_t statuses_[kStatuses] = {};
+    Buffer<uint8_t> status_;
+    Buffer<Record<R>> records_;
+    Buffer<int64_t> begin_, pair_begin_, pair_count_, slots_;
+    Buffer<uint32_t> ids_;
+    Buffer<uint16_t> masks_;
+    Buffer<int32_t> processed_, items_;
+};
+
+// Mean structural similarity of two [height, width, 3] images; `gradient` (of the mean) may be null.
+template <class R>
+double ssim(int64_t height, int64_t width, const R* image, const R* target, R* gradient, int threads);
+
+}  // namespace graings

@@ -1,0 +1,81 @@
+#include "isa.hpp"
+
+#include <atomic>
+#include <cstdlib>
+#include <stdexcept>
+
+namespace graings {
+
+#define GRAINGS_DECLARE(isa)                            \
+    namespace isa {                                     \
+    extern const Kernels<float> single_precision;       \
+    extern const Kernels<double> double_precision;      \
+    }
+GRAINGS_DECLARE(generic)
+#ifdef GRAINGS_X86
+GRAINGS_DECLARE(avx2)
+GRAINGS_DECLARE(avx512)
+#endif
+
+namespace {
+
+struct Entry {
+    const char* name;
+    bool (*runs_here)();
+    const Kernels<float>* single_precision;
+    const Kernels<double>* double_precision;
+};
+
+const Entry kEntries[] = {
+#ifdef GRAINGS_X86
+    {"avx512",
+     [] {
+         __builtin_cpu_init();
+         return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
+                __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("fma");
+     },
+     &avx512::single_precision, &avx512::double_precision},
+    {"avx2", [] { __builtin_cpu_init(); return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"); },
+     &avx2::single_precision, &avx2::double_precision},
+#endif
+    {"generic", [] { return true; }, &generic::single_precision, &generic::double_precision},
+};
+
+std::atomic<const Entry*> active{nullptr};
+
+const Entry* find(const std::string& name) {
+    for (const Entry& entry : kEntries)
+        if (name == entry.name && entry.runs_here()) return &entry;
+    std::string known;
+    for (const auto& isa : available_isas()) known += (known.empty() ? "" : ", ") + isa;
+    throw std::invalid_argument("instruction set '" + name + "' is not available here; choose one of: " + known);
+}
+
+const Entry& entry() {
+    const Entry* chosen = active.load(std::memory_order_acquire);
+    if (chosen) return *chosen;
+    const char* wish = std::getenv("GRAINGS_ISA");
+    if (wish && *wish) chosen = find(wish);
+    else
+        for (const Entry& candidate : kEntries)
+            if (candidate.runs_here()) { chosen = &candidate; break; }
+    active.store(chosen, std::memory_order_release);
+    return *chosen;
+}
+
+}  // namespace
+
+std::vector<std::string> available_isas() {
+    std::vector<std::string> names;
+    for (const Entry& candidate : kEntries)
+        if (candidate.runs_here()) names.emplace_back(candidate.name);
+    return names;
+}
+
+std::string active_isa() { return entry().name; }
+void use_isa(const std::string& name) { active.store(find(name), std::memory_order_release); }
+
+template <> const Kernels<float>& kernels<float>() { return *entry().single_precision; }
+template <> const Kernels<double>& kernels<double>() { return *entry().double_precision; }
+
+}  // namespace graings

@@ -1,0 +1,14 @@
+// Which instruction set runs. The best one this CPU has, unless GRAINGS_ISA or use_isa() says otherwise.
+#pragma once
+#include <string>
+#include <vector>
+#include "types.hpp"
+
+namespace graings {
+
+std::vector<std::string> available_isas();   // best first
+std::string active_isa();                    // throws std::invalid_argument when GRAINGS_ISA names an unusable one
+void use_isa(const std::string& name);       // for the whole process
+template <class R> const Kernels<R>& kernels();
+
+}  // namespace graings

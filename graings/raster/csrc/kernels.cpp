@@ -1,0 +1,20 @@
+// Compiled once per instruction set (CMakeLists.txt defines GRAINGS_ISA and the flags).
+#include <type_traits>
+#include "geometry.hpp"
+#include "ssim.hpp"
+#include "tiles.hpp"
+
+namespace graings {
+
+namespace GRAINGS_ISA {
+template <class R>
+constexpr Kernels<R> table() {
+    return {project<R>, draw_tile<R>, tile_gradient<R>, geometry_gradient<R>, ssim_values<R>, ssim_gradient<R>};
+}
+extern const Kernels<float> single_precision;
+extern const Kernels<double> double_precision;
+const Kernels<float> single_precision = table<float>();
+const Kernels<double> double_precision = table<double>();
+}  // namespace GRAINGS_ISA
+
+}  // namespace graings

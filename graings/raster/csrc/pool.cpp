@@ -1,0 +1,103 @@
+#include "pool.hpp"
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <exception>
+#include <list>
+#include <mutex>
+#include <thread>
+
+namespace graings {
+namespace {
+
+struct Job {
+    const std::function<void(int, int64_t)>* body;
+    int64_t pieces;
+    int seats;  // workers that may still join
+    int next_worker = 1;
+    int inside = 0;
+    std::atomic<int64_t> next{0};
+    std::exception_ptr error{};
+
+    void work(int worker) {
+        for (int64_t piece; (piece = next.fetch_add(1, std::memory_order_relaxed)) < pieces;) (*body)(worker, piece);
+    }
+};
+
+class Pool {
+public:
+    void run(int threads, int64_t pieces, const std::function<void(int, int64_t)>& body) {
+        Job job{&body, pieces, threads - 1};
+        {
+            std::lock_guard lock(mutex_);
+            while (size_ < threads - 1) {
+                std::thread([this] { serve(); }).detach();  // ends with the process
+                size_++;
+            }
+            jobs_.push_back(&job);
+        }
+        wake_.notify_all();
+        std::exception_ptr error;
+        try {
+            job.work(0);
+        } catch (...) {
+            error = std::current_exception();
+            job.next.store(pieces, std::memory_order_relaxed);
+        }
+        std::unique_lock lock(mutex_);
+        jobs_.remove(&job);
+        left_.wait(lock, [&] { return job.inside == 0; });
+        if (!error) error = job.error;
+        if (error) std::rethrow_exception(error);
+    }
+
+private:
+    [[noreturn]] void serve() {
+        std::unique_lock lock(mutex_);
+        for (;;) {
+            Job* job = nullptr;
+            wake_.wait(lock, [&] {
+                for (Job* candidate : jobs_)
+                    if (candidate->seats > 0) { job = candidate; return true; }
+                return false;
+            });
+            job->seats--, job->inside++;
+            const int worker = job->next_worker++;
+            lock.unlock();
+            std::exception_ptr error;
+            try {
+                job->work(worker);
+            } catch (...) {
+                error = std::current_exception();
+                job->next.store(job->pieces, std::memory_order_relaxed);
+            }
+            lock.lock();
+            if (error && !job->error) job->error = error;
+            if (--job->inside == 0) left_.notify_all();
+        }
+    }
+
+    std::mutex mutex_;
+    std::condition_variable wake_, left_;
+    std::list<Job*> jobs_;
+    int size_ = 0;
+};
+
+Pool& pool() {
+    static Pool* forever = new Pool;  // never destroyed: its threads outlive static destruction
+    return *forever;
+}
+
+}  // namespace
+
+void parallel_for(int threads, int64_t pieces, const std::function<void(int, int64_t)>& body) {
+    threads = int(std::min<int64_t>(threads, pieces));
+    if (threads <= 1) {
+        for (int64_t piece = 0; piece < pieces; piece++) body(0, piece);
+        return;
+    }
+    pool().run(threads, pieces, body);
+}
+
+}  // namespace graings

@@ -1,0 +1,224 @@
+// Vectors of N numbers built from the registers of the instruction set this file is compiled for.
+// Everything lives in the namespace of that instruction set and is inlined, so that no symbol compiled for
+// a newer CPU can be picked by the linker for an older one. Products and sums are fused only where `fma` says so.
+#pragma once
+#include <cstdint>
+#include <cstring>
+#if defined(__x86_64__)
+#include <immintrin.h>
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+
+#ifndef GRAINGS_ISA
+#error "compile through CMake: GRAINGS_ISA names the instruction set"
+#endif
+#define GRAINGS_INLINE static inline __attribute__((always_inline))
+
+namespace graings::GRAINGS_ISA {
+
+#if defined(__AVX512F__)
+constexpr int kBytes = 64;
+#elif defined(__AVX2__)
+constexpr int kBytes = 32;
+#else
+constexpr int kBytes = 16;
+#endif
+
+template <class T> struct Bits;
+template <> struct Bits<float> { using type = int32_t; };
+template <> struct Bits<double> { using type = int64_t; };
+
+template <class T> constexpr int kNative = kBytes / static_cast<int>(sizeof(T));
+template <class T> struct NativeOf { typedef T type __attribute__((vector_size(kBytes))); };
+template <class T> using Native = typename NativeOf<T>::type;
+template <class T> using NativeBits = typename NativeOf<typename Bits<T>::type>::type;
+
+// ---- one register
+#if defined(__AVX512F__)
+template <class T> using NativeMask = std::conditional_t<sizeof(T) == 4, __mmask16, __mmask8>;
+GRAINGS_INLINE __mmask16 less(Native<float> a, Native<float> b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ); }
+GRAINGS_INLINE __mmask8 less(Native<double> a, Native<double> b) { return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LT_OQ); }
+GRAINGS_INLINE __mmask16 less_equal(Native<float> a, Native<float> b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
+GRAINGS_INLINE __mmask8 less_equal(Native<double> a, Native<double> b) { return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LE_OQ); }
+GRAINGS_INLINE Native<float> choose(__mmask16 m, Native<float> a, Native<float> b) { return (Native<float>)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
+GRAINGS_INLINE Native<double> choose(__mmask8 m, Native<double> a, Native<double> b) { return (Native<double>)_mm512_mask_blend_pd(m, (__m512d)b, (__m512d)a); }
+GRAINGS_INLINE bool some(__mmask16 m) { return m != 0; }
+GRAINGS_INLINE bool some(__mmask8 m) { return m != 0; }
+GRAINGS_INLINE Native<float> fused(Native<float> a, Native<float> b, Native<float> c) { return (Native<float>)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
+GRAINGS_INLINE Native<double> fused(Native<double> a, Native<double> b, Native<double> c) { return (Native<double>)_mm512_fmadd_pd((__m512d)a, (__m512d)b, (__m512d)c); }
+GRAINGS_INLINE Native<float> least(Native<float> a, Native<float> b) { return (Native<float>)_mm512_min_ps((__m512)a, (__m512)b); }
+GRAINGS_INLINE Native<double> least(Native<double> a, Native<double> b) { return (Native<double>)_mm512_min_pd((__m512d)a, (__m512d)b); }
+GRAINGS_INLINE Native<float> most(Native<float> a, Native<float> b) { return (Native<float>)_mm512_max_ps((__m512)a, (__m512)b); }
+GRAINGS_INLINE Native<double> most(Native<double> a, Native<double> b) { return (Native<double>)_mm512_max_pd((__m512d)a, (__m512d)b); }
+GRAINGS_INLINE Native<double> root(Native<double> a) { return (Native<double>)_mm512_sqrt_pd((__m512d)a); }
+GRAINGS_INLINE float total(Native<float> a) { return _mm512_reduce_add_ps((__m512)a); }
+GRAINGS_INLINE double total(Native<double> a) { return _mm512_reduce_add_pd((__m512d)a); }
+#else
+template <class T> using NativeMask = NativeBits<T>;
+template <class V> GRAINGS_INLINE auto less(V a, V b) { return a < b; }
+template <class V> GRAINGS_INLINE auto less_equal(V a, V b) { return a <= b; }
+template <class M, class V> GRAINGS_INLINE V choose(M m, V a, V b) { return m ? a : b; }
+template <class M> GRAINGS_INLINE bool some(M m) {
+    bool any = false;
+    for (int i = 0; i < static_cast<int>(sizeof(M) / sizeof(m[0])); i++) any |= m[i] != 0;
+    return any;
+}
+template <class V> GRAINGS_INLINE V least(V a, V b) { return a < b ? a : b; }
+template <class V> GRAINGS_INLINE V most(V a, V b) { return a > b ? a : b; }
+GRAINGS_INLINE float total(Native<float> a) {
+    float sum[kNative<float>];
+    std::memcpy(sum, &a, sizeof sum);
+    for (int step = kNative<float> / 2; step > 0; step /= 2)
+        for (int i = 0; i < step; i++) sum[i] += sum[i + step];
+    return sum[0];
+}
+GRAINGS_INLINE double total(Native<double> a) {
+    double sum[kNative<double>];
+    std::memcpy(sum, &a, sizeof sum);
+    for (int step = kNative<double> / 2; step > 0; step /= 2)
+        for (int i = 0; i < step; i++) sum[i] += sum[i + step];
+    return sum[0];
+}
+#if defined(__AVX2__)
+GRAINGS_INLINE Native<float> fused(Native<float> a, Native<float> b, Native<float> c) { return (Native<float>)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
+GRAINGS_INLINE Native<double> fused(Native<double> a, Native<double> b, Native<double> c) { return (Native<double>)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c); }
+GRAINGS_INLINE Native<double> root(Native<double> a) { return (Native<double>)_mm256_sqrt_pd((__m256d)a); }
+#elif defined(__aarch64__)
+GRAINGS_INLINE Native<float> fused(Native<float> a, Native<float> b, Native<float> c) { return (Native<float>)vfmaq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b); }
+GRAINGS_INLINE Native<double> fused(Native<double> a, Native<double> b, Native<double> c) { return (Native<double>)vfmaq_f64((float64x2_t)c, (float64x2_t)a, (float64x2_t)b); }
+GRAINGS_INLINE Native<double> root(Native<double> a) { return (Native<double>)vsqrtq_f64((float64x2_t)a); }
+#else
+template <class V> GRAINGS_INLINE V fused(V a, V b, V c) { return a * b + c; }
+GRAINGS_INLINE Native<double> root(Native<double> a) {
+    for (int i = 0; i < kNative<double>; i++) a[i] = __builtin_sqrt(a[i]);
+    return a;
+}
+#endif
+#endif
+
+// ---- N numbers: one register, or two halves
+template <class T, int N, bool One = (N == kNative<T>)> struct Vec;
+template <class T, int N, bool One = (N == kNative<T>)> struct Mask;
+template <class T, int N> struct Vec<T, N, true> { Native<T> v; };
+template <class T, int N> struct Mask<T, N, true> { NativeMask<T> v; };
+template <class T, int N> struct Vec<T, N, false> {
+    static_assert(N > kNative<T>, "narrower than a register");
+    Vec<T, N / 2> lo, hi;
+};
+template <class T, int N> struct Mask<T, N, false> { Mask<T, N / 2> lo, hi; };
+
+template <class T, int N> constexpr bool kOne = N == kNative<T>;
+
+#define GRAINGS_VEC template <class T, int N> GRAINGS_INLINE
+#define GRAINGS_BINARY(name, expression)                                     \
+    GRAINGS_VEC Vec<T, N> name(Vec<T, N> a, Vec<T, N> b) {                   \
+        if constexpr (kOne<T, N>) return {expression};                       \
+        else return {name(a.lo, b.lo), name(a.hi, b.hi)};                    \
+    }
+GRAINGS_BINARY(operator+, a.v + b.v)
+GRAINGS_BINARY(operator-, a.v - b.v)
+GRAINGS_BINARY(operator*, a.v* b.v)
+GRAINGS_BINARY(operator/, a.v / b.v)
+GRAINGS_BINARY(min, least(a.v, b.v))
+GRAINGS_BINARY(max, most(a.v, b.v))
+#undef GRAINGS_BINARY
+GRAINGS_VEC Vec<T, N> splat(T x) {
+    if constexpr (kOne<T, N>) { Native<T> zero = {}; return {zero + x}; }
+    else { auto h = splat<T, N / 2>(x); return {h, h}; }
+}
+GRAINGS_VEC Vec<T, N> operator-(Vec<T, N> a) { return splat<T, N>(T(0)) - a; }
+GRAINGS_VEC Vec<T, N> operator*(T a, Vec<T, N> b) { return splat<T, N>(a) * b; }
+GRAINGS_VEC Vec<T, N> fma(Vec<T, N> a, Vec<T, N> b, Vec<T, N> c) {
+    if constexpr (kOne<T, N>) return {fused(a.v, b.v, c.v)};
+    else return {fma(a.lo, b.lo, c.lo), fma(a.hi, b.hi, c.hi)};
+}
+GRAINGS_VEC Vec<T, N> sqrt(Vec<T, N> a) {
+    if constexpr (kOne<T, N>) return {root(a.v)};
+    else return {sqrt(a.lo), sqrt(a.hi)};
+}
+template <int N, class T> GRAINGS_INLINE Vec<T, N> load(const T* p) {
+    if constexpr (kOne<T, N>) { Vec<T, N> r; std::memcpy(&r.v, p, sizeof r.v); return r; }
+    else return {load<N / 2>(p), load<N / 2>(p + N / 2)};
+}
+GRAINGS_VEC void store(T* p, Vec<T, N> a) {
+    if constexpr (kOne<T, N>) std::memcpy(p, &a.v, sizeof a.v);
+    else { store(p, a.lo); store(p + N / 2, a.hi); }
+}
+GRAINGS_VEC Mask<T, N> operator<(Vec<T, N> a, Vec<T, N> b) {
+    if constexpr (kOne<T, N>) return {static_cast<NativeMask<T>>(less(a.v, b.v))};
+    else return {a.lo < b.lo, a.hi < b.hi};
+}
+GRAINGS_VEC Mask<T, N> operator<=(Vec<T, N> a, Vec<T, N> b) {
+    if constexpr (kOne<T, N>) return {static_cast<NativeMask<T>>(less_equal(a.v, b.v))};
+    else return {a.lo <= b.lo, a.hi <= b.hi};
+}
+GRAINGS_VEC Vec<T, N> select(Mask<T, N> m, Vec<T, N> a, Vec<T, N> b) {
+    if constexpr (kOne<T, N>) return {choose(m.v, a.v, b.v)};
+    else return {select(m.lo, a.lo, b.lo), select(m.hi, a.hi, b.hi)};
+}
+GRAINGS_VEC bool any(Mask<T, N> m) {
+    if constexpr (kOne<T, N>) return some(m.v);
+    else return any(m.lo) || any(m.hi);
+}
+GRAINGS_VEC T sum(Vec<T, N> a) {
+    if constexpr (kOne<T, N>) return total(a.v);
+    else return sum(a.lo + a.hi);
+}
+GRAINGS_VEC Vec<T, N> clamp(Vec<T, N> x, Vec<T, N> low, Vec<T, N> high) { return min(max(x, low), high); }
+// p * 2^n, where `shifted` = n + 1.5 * 2^mantissa holds the integer n in its low bits
+GRAINGS_VEC Vec<T, N> scale_by_power(Vec<T, N> p, Vec<T, N> shifted) {
+    if constexpr (kOne<T, N>) {
+        constexpr int mantissa = sizeof(T) == 4 ? 23 : 52;
+        return {(Native<T>)((NativeBits<T>)p.v + ((NativeBits<T>)shifted.v << mantissa))};
+    } else return {scale_by_power(p.lo, shifted.lo), scale_by_power(p.hi, shifted.hi)};
+}
+
+// ---- exponentials
+template <int N> GRAINGS_INLINE Vec<float, N> power_of_two_part(Vec<float, N> f) {
+    // Minimax on [-1/2, 1/2] with the constant term fixed at 1: 2e-9 before rounding, 9.7e-8 after.
+    auto p = splat<float, N>(1.5353356e-4f);
+    p = fma(p, f, splat<float, N>(1.3398875e-3f));
+    p = fma(p, f, splat<float, N>(9.6184378e-3f));
+    p = fma(p, f, splat<float, N>(5.5503324e-2f));
+    p = fma(p, f, splat<float, N>(2.4022648e-1f));
+    p = fma(p, f, splat<float, N>(6.9314718e-1f));
+    return fma(p, f, splat<float, N>(1.0f));
+}
+template <int N> GRAINGS_INLINE Vec<double, N> power_of_two_part(Vec<double, N> f) {
+    // Taylor coefficients ln(2)^k / k!: the remainder on [-1/2, 1/2] is 4e-18.
+    constexpr double c[] = {1.3691488853904124e-12, 2.5678435993488196e-11, 4.44553827187081e-10, 7.054911620801121e-09,
+                            1.0178086009239696e-07, 1.3215486790144305e-06, 1.5252733804059838e-05, 1.5403530393381606e-04,
+                            1.3333558146428441e-03, 9.618129107628477e-03, 5.5504108664821576e-02, 0.2402265069591007,
+                            0.6931471805599453, 1.0};
+    auto p = splat<double, N>(c[0]);
+    for (int k = 1; k < 14; k++) p = fma(p, f, splat<double, N>(c[k]));
+    return p;
+}
+// 2^-x for x >= 0; far below any contribution (2^-125, 2^-1021) the value stays put.
+GRAINGS_VEC Vec<T, N> exp2_minus(Vec<T, N> x) {
+    constexpr T magic = sizeof(T) == 4 ? T(12582912) : T(6755399441055744);
+    constexpr T limit = sizeof(T) == 4 ? T(125) : T(1021);
+    x = min(x, splat<T, N>(limit));
+    auto shifted = splat<T, N>(magic) - x;
+    auto f = (splat<T, N>(magic) - shifted) - x;
+    return scale_by_power(power_of_two_part(f), shifted);
+}
+// e^x, with x limited to [-708, 709]
+template <int N> GRAINGS_INLINE Vec<double, N> exp(Vec<double, N> x) {
+    constexpr double magic = 6755399441055744;
+    x = clamp(x, splat<double, N>(-708), splat<double, N>(709));
+    auto shifted = fma(x, splat<double, N>(1.4426950408889634), splat<double, N>(magic));
+    auto n = shifted - splat<double, N>(magic);
+    auto f = fma(n, splat<double, N>(-6.93147180369123816490e-01), x);
+    f = fma(n, splat<double, N>(-1.90821492927058770002e-10), f);
+    constexpr double c[] = {1.6059043836821613e-10, 2.08767569878681e-09, 2.505210838544172e-08, 2.755731922398589e-07,
+                            2.7557319223985893e-06, 2.48015873015873e-05, 1.984126984126984e-04, 1.388888888888889e-03,
+                            8.333333333333333e-03, 4.1666666666666664e-02, 0.16666666666666666, 0.5, 1.0, 1.0};
+    auto p = splat<double, N>(c[0]);
+    for (int k = 1; k < 14; k++) p = fma(p, f, splat<double, N>(c[k]));
+    return scale_by_power(p, shifted);
+}
+#undef GRAINGS_VEC
+
+}  // namespace graings::GRAINGS_ISA

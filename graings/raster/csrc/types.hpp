@@ -1,0 +1,134 @@
+// Plain data shared by all parts of the kernel. No code, no ownership: what is here has the same layout
+// for every instruction set.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+namespace graings {
+
+constexpr int kTile = 16;    // edge of a tile in pixels
+constexpr int kBlocks = 16;  // 4x4-pixel blocks per tile, row by row
+constexpr int kLanes = 16;   // pixels per block, row by row
+constexpr int kSums = 10;    // partial sums per (tile, Gaussian)
+
+struct Camera {
+    double rotation[9];  // world to camera, row by row
+    double center[3];    // in the world
+    double fx, fy, cx, cy;
+    int64_t width, height;
+};
+
+struct Settings {
+    double alpha_min, transmittance_min, alpha_max, blur, near, frustum_margin;
+    bool compat;  // exclusive stop and the square of three standard deviations, as public rasterizers do
+};
+
+enum Status : uint8_t { kDrawn, kNonFinite, kZeroQuat, kBehind, kFaint, kOutside, kStatuses };
+
+// One projected Gaussian: a cache line in single precision. With dx, dy = pixel - mean,
+// alpha = opacity * 2^-((sr (dx - slope dy))^2 + (sy dy)^2); nothing is drawn where the exponent exceeds `level`.
+template <class R>
+struct alignas(64) Record {
+    double x, y, slope, sr, sy;
+    R opacity, red, green, blue, depth, level;
+};
+static_assert(sizeof(Record<float>) == 64);
+
+// A record seen from one tile: the scaled distances at the centre of each block (rounded once, from float64)
+// and their spread over the 16 pixels of a block.
+template <class R>
+struct alignas(64) TileEntry {
+    R spread[kLanes];
+    R center_r[kBlocks];
+    R center_s[4];
+    R sy, opacity, red, green, blue, depth;
+};
+
+template <class R>
+struct Inputs {
+    int64_t count;
+    const R *means, *quats, *log_scales, *opacities, *colors;
+    const R* offset;  // [N, 2] px or null
+    const R* background;
+};
+
+template <class R>
+struct ProjectArgs {
+    Camera camera;
+    Settings settings;
+    Inputs<R> in;
+    Record<R>* records;
+    uint8_t* status;
+    double* depths;
+    R *means2d, *radii;
+};
+
+// What the tile stage reads: entries of tile t are [begin[t], begin[t+1]), in depth order.
+template <class R>
+struct TileArgs {
+    Camera camera;
+    Settings settings;
+    const R* background;
+    const Record<R>* records;
+    const int64_t* begin;
+    const uint32_t* ids;
+    uint16_t* masks;      // blocks of the tile that the entry may touch and that were still open
+    int32_t* processed;   // entries per tile that were looked at before every pixel had stopped
+    int32_t* items;       // (entry, block) pairs per tile
+    R *color, *alpha, *depth;
+};
+
+template <class R>
+struct TileGradientArgs {
+    TileArgs<R> tiles;
+    const int64_t* slots;              // where the sums of an entry go: contiguous per Gaussian, in tile order
+    const R *v_color, *v_alpha, *v_depth;  // the last two may be null
+    R* sums;                           // [slot, kSums]
+    double* v_background;              // [tile, 3]
+};
+
+template <class R>
+struct TileScratch {
+    TileEntry<R>* entries;
+    int32_t* first_item;
+    R* alphas;   // [item, lane]
+    R* weights;  // [item, lane]; negative where alpha was capped
+};
+
+template <class R>
+struct GeometryGradientArgs {
+    Camera camera;
+    Settings settings;
+    Inputs<R> in;
+    const uint8_t* status;
+    const Record<R>* records;
+    const int64_t* pair_begin;  // per Gaussian
+    const int64_t* pair_count;
+    const R* sums;
+    R *v_means, *v_quats, *v_log_scales, *v_opacities, *v_colors, *v_offset;  // v_offset may be null
+};
+
+template <class R>
+struct SsimArgs {
+    int64_t height, width;
+    const R *image, *target;
+    R* gradient;    // [height, width, 3] or null
+    R* maps;        // three planes [height, width, 3]: what the gradient filters back
+    double* sums;   // one per band
+    double scale;   // 1 / (pixels * channels)
+};
+
+// The functions compiled once per instruction set.
+template <class R>
+struct Kernels {
+    void (*project)(const ProjectArgs<R>&, int64_t begin, int64_t end);
+    void (*draw_tile)(const TileArgs<R>&, int64_t tile, TileEntry<R>* chunk);
+    void (*tile_gradient)(const TileGradientArgs<R>&, int64_t tile, const TileScratch<R>&);
+    void (*geometry_gradient)(const GeometryGradientArgs<R>&, int64_t begin, int64_t end);
+    void (*ssim_values)(const SsimArgs<R>&, int64_t band, int64_t begin, int64_t end, R* scratch);
+    void (*ssim_gradient)(const SsimArgs<R>&, int64_t begin, int64_t end, R* scratch);
+};
+
+constexpr int kChunk = 32;  // entries of a tile prepared at a time in the forward pass
+
+}  // namespace graings

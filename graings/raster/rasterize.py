@@ -1,0 +1,147 @@
+"""The picture of Gaussians, drawn by the compiled kernel.
+
+The torch side only: checks, buffers and autograd. What is drawn is defined by `graings.raster.reference`,
+with which the kernel agrees. Knows nothing of scenes, losses or files.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
+
+from graings.camera import Camera
+from graings.gaussians import Gaussians
+from graings.raster.arguments import check_arguments
+from graings.raster.kernel import kernel
+from graings.raster.result import RasterSettings, RenderResult
+
+
+def rasterize(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor,
+    *,
+    means2d_offset: Tensor | None = None,
+    settings: RasterSettings = RasterSettings(),
+    threads: int | None = None,
+) -> RenderResult:
+    """Draw `gaussians` seen by `camera` on `background` [3] (RGB, same dtype); Eq. (1) and (2).
+
+    `means2d_offset` [N, 2] is added to the projected centres (pixels): pass zeros that require a gradient to
+    learn the gradient in screen space. A Gaussian that is not drawn receives a gradient of exactly zero.
+    `threads` is the number of CPU threads (None: those of torch); the result has the same bits for any number.
+    Pixels are computed in the dtype of the Gaussians, geometry always in float64.
+
+    Raises `ValueError` for a wrong shape, dtype or device, `KernelError` when the kernel is not built.
+    """
+    check_arguments(gaussians, background, means2d_offset, threads)
+    tensors = (
+        gaussians.means,
+        gaussians.quats,
+        gaussians.log_scales,
+        gaussians.opacities,
+        gaussians.colors,
+        background,
+        means2d_offset,
+    )
+    workers = torch.get_num_threads() if threads is None else threads
+    color, alpha, depth, means2d, radii, culled = _Rasterize.apply(*tensors, gaussians.uids, camera, settings, workers)  # type: ignore[no-untyped-call]
+    return RenderResult(color, alpha, depth, means2d, radii, culled)
+
+
+def _ready(tensor: Tensor) -> Tensor:
+    return tensor.detach().contiguous()
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        background: Tensor,
+        offset: Tensor | None,
+        uids: Tensor,
+        camera: Camera,
+        settings: RasterSettings,
+        threads: int,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
+        ready = [_ready(t) for t in (means, quats, log_scales, opacities, colors)]
+        shift = None if offset is None else _ready(offset)
+        ground = _ready(background)
+        n, height, width = len(means), camera.height, camera.width
+        color = means.new_empty(height, width, 3)
+        alpha, depth = means.new_empty(height, width), means.new_empty(height, width)
+        means2d, radii = means.new_empty(n, 2), means.new_empty(n, 2)
+        module = kernel()
+        draw = module.draw_float if means.dtype == torch.float32 else module.draw_double
+        frame = draw(
+            *ready,
+            shift,
+            ground,
+            _ready(uids),
+            np.ascontiguousarray(camera.world_to_camera[:3, :3]),
+            np.ascontiguousarray(camera.center),
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            width,
+            height,
+            settings.alpha_min,
+            settings.transmittance_min,
+            settings.alpha_max,
+            settings.blur,
+            settings.near,
+            settings.frustum_margin,
+            settings.compat,
+            color,
+            alpha,
+            depth,
+            means2d,
+            radii,
+            threads,
+        )
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(means2d, radii)
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(*ready, ground, *([] if shift is None else [shift]))
+            ctx.frame, ctx.threads, ctx.size = frame, threads, (height, width)
+        return color, alpha, depth, means2d, radii, frame.culled
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, v_color: Tensor | None, v_alpha: Tensor | None, v_depth: Tensor | None, *_: FunctionCtx
+    ) -> tuple[Tensor | None, ...]:
+        nothing: tuple[None, ...] = (None,) * 11
+        if v_color is None and v_alpha is None and v_depth is None:
+            return nothing
+        means, quats, log_scales, opacities, colors, ground, *rest = ctx.saved_tensors
+        shift = rest[0] if rest else None
+        height, width = ctx.size
+        upstream = means.new_zeros(height, width, 3) if v_color is None else _ready(v_color)
+        inputs = (means, quats, log_scales, opacities, colors)
+        gradients = [torch.empty_like(t) for t in (*inputs, ground)]
+        v_shift = None if shift is None else torch.empty_like(shift)
+        ctx.frame.gradient(
+            *inputs,
+            shift,
+            ground,
+            height,
+            width,
+            upstream,
+            None if v_alpha is None else _ready(v_alpha),
+            None if v_depth is None else _ready(v_depth),
+            *gradients,
+            v_shift,
+            ctx.threads,
+        )
+        return (*gradients, v_shift, None, None, None, None)
