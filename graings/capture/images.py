@@ -102,14 +102,15 @@ def shrink(image: Image, width: int, height: int) -> Image:
 
 
 def _cell_means(values: NDArray[np.floating], cells: int, axis: int) -> NDArray[np.float64]:
-    # The integral of a row of pixels is piecewise linear: its differences at the cells' edges are exact sums.
     size = values.shape[axis]
-    rows = np.moveaxis(values, axis, 0).astype(np.float64)
-    if cells == size:
-        return np.moveaxis(rows, 0, axis)
-    integral = np.concatenate([np.zeros_like(rows[:1]), np.cumsum(rows, axis=0)])
     edges = np.arange(cells + 1) * size / cells
-    below = np.minimum(edges.astype(np.intp), size - 1)
-    part = (edges - below).reshape(-1, *([1] * (rows.ndim - 1)))
-    means = np.diff(integral[below] + part * rows[below], axis=0) * (cells / size)
-    return np.moveaxis(means, 0, axis)
+    first = np.minimum(edges[:-1].astype(np.intp), size - 1)
+    total = np.zeros(1)
+    # The k-th pixel of every cell at once: few steps on long arrays, in float64 so that rounding stays below float32's.
+    for pixel in range(int(np.ceil(edges[1:] - first).max())):
+        index = first + pixel
+        overlap = np.minimum(edges[1:], index + 1) - np.maximum(edges[:-1], index)
+        weight = np.clip(overlap, 0.0, None) * (cells / size)
+        weight = weight[:, None, None] if axis == 0 else np.repeat(weight[:, None], values.shape[2], axis=1)
+        total = total + np.take(values, np.minimum(index, size - 1), axis=axis) * weight
+    return total
