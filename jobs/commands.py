@@ -49,7 +49,7 @@ def worker(
     if exit_with_parent:
         watch_parent(stop.set)
     store = Store(data)
-    chosen = threads or max(1, (os.cpu_count() or 1) // slots)
+    chosen = threads or max(1, len(os.sched_getaffinity(0)) // slots)
     try:
         Worker(store, database or default_database(store.root), slots=slots, threads=chosen).run(stop)
     except JobError as error:

@@ -100,7 +100,10 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job as a front end sees it. Times are Unix seconds; `progress` is the trainer's last report as JSON."""
+    """A job as a front end sees it. Times are Unix seconds; `progress` is the trainer's last report as JSON.
+
+    `checkpoint` is the iteration of the newest one.
+    """
 
     id: str
     spec: JobSpec
@@ -111,6 +114,7 @@ class Job:
     attempts: int
     progress: dict[str, Any] | None
     checkpoint: int | None
+    has_metrics: bool
     error: str | None
 
 

@@ -104,5 +104,6 @@ class JobQueue:
             attempts=attempts[-1].number if attempts else 0,
             progress=last_progress(folder.progress),
             checkpoint=folder.checkpoint(),
+            has_metrics=folder.metrics.exists(),
             error=None if ticket is None else ticket.error,
         )

@@ -1,0 +1,49 @@
+"""The application: routes, errors and what they work with, put together."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import torch
+from anyio import to_thread
+from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
+
+import graings
+from service import problems
+from service.body_limit import BodyLimit
+from service.context import MB, open_context
+from service.routes import jobs, render, results, system
+from service.settings import Settings
+
+_SMALL_BODY = 64 * 1024
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The service as an ASGI application; it opens its data folder when it starts."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        torch.set_num_threads(settings.render_threads)
+        app.state.context = await to_thread.run_sync(open_context, settings)
+        try:
+            yield
+        finally:
+            await to_thread.run_sync(app.state.context.close)
+
+    def limit(method: str, path: str) -> int:
+        return settings.max_upload_mb * MB if (method, path) == ("POST", "/jobs") else _SMALL_BODY
+
+    app = FastAPI(
+        title="GrainGS",
+        version=graings.__version__,
+        summary="See a moving scene from anywhere, at any time, with nothing but a CPU.",
+        lifespan=lifespan,
+    )
+    app.add_middleware(BodyLimit, limit=limit)
+    problems.install(app)
+    for routes in (jobs, results, render, system):
+        app.include_router(routes.router)
+    app.mount("/web", StaticFiles(directory=system.WEB), name="web")
+    return app

@@ -1,0 +1,180 @@
+"""Archives: unpack a zip or tar that a stranger sent, or refuse it.
+
+Only plain files and folders come out, only below the target, only as much as the limits allow; what an archive says
+about itself is not believed. Knows nothing of captures or HTTP.
+"""
+
+from __future__ import annotations
+
+import lzma
+import os
+import shutil
+import stat
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from service.problems import ArchiveError
+
+# What a capture is made of; anything else in the archive is left out.
+_DATA = (".json", ".txt", ".ply", ".bin", ".npy", ".npz")
+_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff", ".bmp", ".tga", ".hdr")
+SUFFIXES = frozenset((*_DATA, *_IMAGES))
+_CHUNK = 1 << 20
+_MAX_DEPTH = 16
+_MAX_NAME = 255
+_RATIO_FROM = 16 << 20  # below this much, any ratio is harmless
+_BROKEN = (
+    zipfile.BadZipFile,
+    tarfile.TarError,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    UnicodeError,
+    ValueError,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How much may come out of an archive."""
+
+    files: int
+    bytes: int
+    ratio: int = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Unpacked:
+    """What came out, and how many entries were left out because a capture has no such files."""
+
+    files: int
+    bytes: int
+    skipped: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """A plain file in an archive."""
+
+    name: str
+    stream: IO[bytes]
+
+
+def unpack(archive: Path, folder: Path, limits: Limits) -> Unpacked:
+    """Unpack into `folder`, which is made and must not exist. Raises `ArchiveError` and leaves nothing behind."""
+    folder.mkdir()
+    try:
+        return _unpack(archive, folder, limits)
+    except _BROKEN as error:
+        shutil.rmtree(folder)
+        raise ArchiveError(f"The archive is damaged: {error}. Pack the capture again.") from error
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
+
+
+def _unpack(archive: Path, folder: Path, limits: Limits) -> Unpacked:
+    packed = max(1, archive.stat().st_size)
+    files = total = skipped = 0
+    seen: set[str] = set()
+    for entry in _entries(archive, limits):
+        path = _checked(entry.name, seen)
+        if not _wanted(path):
+            skipped += 1
+            continue
+        files += 1
+        target = folder.joinpath(*path.parts)
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise ArchiveError(f"{entry.name!r} is both a file and a folder. Pack the capture again.") from error
+        with os.fdopen(handle, "wb") as out:
+            while chunk := entry.stream.read(_CHUNK):
+                total += len(chunk)
+                if total > limits.bytes:
+                    raise ArchiveError(f"The archive unpacks to more than {limits.bytes} bytes.")
+                if total > _RATIO_FROM and total > limits.ratio * packed:
+                    raise ArchiveError(f"The archive unpacks to more than {limits.ratio} times its size.")
+                out.write(chunk)
+    if files == 0:
+        raise ArchiveError(
+            "There is no file of a capture in the archive: transforms_*.json or a COLMAP model, and images."
+        )
+    return Unpacked(files, total, skipped)
+
+
+def _entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
+    with archive.open("rb") as file:
+        head = file.read(512)
+    if head[:2] == b"PK":
+        yield from _zip_entries(archive, limits)
+    elif head[257:262] == b"ustar" or head[:2] == b"\x1f\x8b":
+        yield from _tar_entries(archive, limits)
+    else:
+        raise ArchiveError("The body is no archive. Send a zip, a tar or a tar.gz.")
+
+
+def _zip_entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
+    with zipfile.ZipFile(archive) as source:
+        _check_count(len(source.infolist()), limits)
+        for info in source.infolist():
+            kind = stat.S_IFMT(info.external_attr >> 16)
+            if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+                raise ArchiveError(f"{info.filename!r} is a link or a device. Only plain files are accepted.")
+            if info.flag_bits & 1:
+                raise ArchiveError(f"{info.filename!r} is encrypted. Pack the capture without a password.")
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ArchiveError(f"{info.filename!r} is compressed in an unusual way. Use deflate.")
+            if not info.is_dir():
+                with source.open(info) as stream:
+                    yield _Entry(info.filename, stream)
+
+
+def _tar_entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
+    with tarfile.open(archive, "r:*") as source:
+        declared = 0
+        for number, member in enumerate(source, start=1):
+            _check_count(number, limits)
+            # Also of what is left out: passing over it means unpacking it.
+            declared += member.size
+            if declared > limits.bytes:
+                raise ArchiveError(f"The archive unpacks to more than {limits.bytes} bytes.")
+            if not (member.isreg() or member.isdir()) or member.issparse():
+                raise ArchiveError(f"{member.name!r} is a link or a device. Only plain files are accepted.")
+            if member.isreg():
+                stream = source.extractfile(member)
+                assert stream is not None  # so for every regular file
+                yield _Entry(member.name, stream)
+
+
+def _check_count(number: int, limits: Limits) -> None:
+    if number > limits.files:
+        raise ArchiveError(f"The archive has more than {limits.files} entries.")
+
+
+def _checked(name: str, seen: set[str]) -> PurePosixPath:
+    """The entry's path, relative and without tricks."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    if path.is_absolute() or ".." in path.parts or ":" in name or any(ord(c) < 32 for c in name) or not path.parts:
+        raise ArchiveError(f"{name!r} points outside of the archive or is no name. Pack the capture again.")
+    if len(path.parts) > _MAX_DEPTH or any(len(part.encode("utf-8", "replace")) > _MAX_NAME for part in path.parts):
+        raise ArchiveError(f"{name[:80]!r}… is too long or too deep.")
+    # Where case does not count, one of two would overwrite the other.
+    key = str(path).casefold()
+    if key in seen:
+        raise ArchiveError(f"{name!r} is in the archive twice. Pack the capture again.")
+    seen.add(key)
+    return path
+
+
+def _wanted(path: PurePosixPath) -> bool:
+    hidden = any(part.startswith(".") or part == "__MACOSX" for part in path.parts)
+    return not hidden and path.suffix.lower() in SUFFIXES

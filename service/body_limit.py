@@ -1,0 +1,42 @@
+"""BodyLimit: refuse request bodies that are too large, whether they say so or not. Knows nothing of what they hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.problems import TooLarge, problem
+
+
+class BodyLimit:
+    """Middleware: `limit(method, path)` is the most bytes that such a request may carry."""
+
+    def __init__(self, app: ASGIApp, limit: Callable[[str, str], int]) -> None:
+        self._app = app
+        self._limit = limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        most = self._limit(request.method, request.url.path)
+        message = f"The body may have at most {most} bytes."
+        declared = request.headers.get("content-length", "")
+        if declared.isdigit() and int(declared) > most:
+            response = problem(request, 413, message, kind="too-large", headers=TooLarge.headers)
+            await response(scope, receive, send)
+            return
+        taken = 0
+
+        async def counted() -> Message:
+            nonlocal taken
+            part = await receive()
+            taken += len(part.get("body", b""))
+            if taken > most:
+                raise TooLarge(message)
+            return part
+
+        await self._app(scope, counted, send)

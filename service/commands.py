@@ -1,0 +1,67 @@
+"""The command `serve`; also `python -m service.commands`. Knows nothing of what is served."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import uvicorn
+
+from graings.errors import ConfigError
+from jobs.parent import watch_parent
+from service.app import create_app
+from service.settings import Settings
+from service.worker_child import WorkerChild
+
+# Open event streams do not end by themselves.
+GRACEFUL_S = 3
+
+
+def serve(
+    data: Annotated[Path | None, typer.Option(help="Folder with captures and jobs (GRAINGS_DATA, ./data).")] = None,
+    database: Annotated[
+        str | None, typer.Option(help="sqlite:///… or postgresql://… (GRAINGS_DATABASE; SQLite in the data folder).")
+    ] = None,
+    host: Annotated[str | None, typer.Option(help="Address to listen on (GRAINGS_HOST, 127.0.0.1).")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on (GRAINGS_PORT, 8000).")] = None,
+    with_worker: Annotated[bool, typer.Option("--with-worker", help="Start a worker beside the service.")] = False,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of that worker's job (all).")] = None,
+    exit_with_parent: Annotated[bool, typer.Option("--exit-with-parent", help="End when standard input ends.")] = False,
+) -> None:
+    """Serve the REST interface and its page until interrupted."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
+    try:
+        settings = Settings.from_environment(data=data, database=database, host=host, port=port)
+    except ConfigError as error:
+        typer.echo(f"serve: {error}", err=True)
+        raise typer.Exit(2) from error
+    server = uvicorn.Server(
+        uvicorn.Config(
+            create_app(settings),
+            host=settings.host,
+            port=settings.port,
+            timeout_graceful_shutdown=GRACEFUL_S,
+            log_config=None,
+            access_log=False,
+        )
+    )
+
+    def leave() -> None:
+        server.should_exit = True
+
+    if exit_with_parent:
+        watch_parent(leave)
+    with ExitStack() as stack:
+        if with_worker:
+            stack.enter_context(WorkerChild(settings, threads))
+        server.run()
+    if not server.started:
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    typer.run(serve)

@@ -1,0 +1,207 @@
+"""The command `demo`: the whole way once, over HTTP, on a small scene that needs no download.
+
+Starts service and worker as `graings serve --with-worker` does, writes the built-in moving capture, sends it, watches
+it train, and fetches views and numbers. A client like any other: it knows the service by its addresses only.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+from urllib.parse import urlencode
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from graings.capture.synthetic import write_synthetic
+from jobs.job import JobState
+
+# A minute or so of training on two cores.
+PRESET = "draft"
+OPTIONS: dict[str, Any] = {
+    "iterations": 800,
+    "capture.max_side": 200,
+    "init.points": 8_000,
+    "density.max_anchors": 3_000,
+}
+CAPTURE: dict[str, int] = {"frames": 60, "size": 200, "bodies": 4}
+
+TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
+VIEWPOINTS: dict[str, dict[str, object]] = {
+    "val0": {"camera": "val:0"},
+    "orbit30": {"azimuth": 30, "width": 400, "height": 400},
+    "orbit150": {"azimuth": 150, "width": 400, "height": 400},
+}
+PREFERRED_PORT = 8000
+START_S = 60.0
+POLL_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Api:
+    """A REST client in a few lines. `url` has no slash at its end."""
+
+    url: str
+
+    def fetch(self, path: str, body: bytes | None = None, kind: str = "application/json") -> bytes:
+        """The body of an answer: to a POST when a `body` is sent, else to a GET. Raises `DemoError`."""
+        request = urllib.request.Request(self.url + path, data=body, headers={"Content-Type": kind})
+        try:
+            with urllib.request.urlopen(request, timeout=120) as answer:
+                content: bytes = answer.read()
+                return content
+        except urllib.error.HTTPError as error:
+            problem = json.loads(error.read())
+            raise DemoError(f"{path}: {problem.get('detail') or problem['title']}") from error
+
+    def json(self, path: str, body: bytes | None = None, kind: str = "application/json") -> Any:
+        return json.loads(self.fetch(path, body, kind))
+
+
+class DemoError(Exception):
+    """The demo cannot go on."""
+
+
+def demo(
+    once: Annotated[bool, typer.Option("--once", help="Exit when the views are there.")] = False,
+    folder: Annotated[Path, typer.Option(help="Where data, views and metrics go.")] = Path("data/demo"),
+) -> None:
+    """Train a small moving scene through the service and look at it."""
+    console = Console()
+    started = time.monotonic()
+    serving = False
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with _service(folder / "service", folder / "service.log") as api:
+            job = _train(api, folder, console)
+            metrics = _fetch(api, job, folder, console)
+            console.print(f"Held-out PSNR [bold]{metrics['splits']['val']['psnr']:.2f} dB[/] (validation views)")
+            console.print(f"All of it took {time.monotonic() - started:.0f} s.")
+            if not once:
+                console.print(f"Serving at [bold]{api.url}[/] — drag the scene, move the time. Ctrl-C ends it.")
+                serving = True
+                threading.Event().wait()
+    except KeyboardInterrupt:
+        # An end that was asked for: the children are gone by now. Only before the views is it a failure.
+        raise typer.Exit(0 if serving else 130) from None
+    except DemoError as error:
+        console.print(f"[red]demo:[/] {error}")
+        raise typer.Exit(1) from error
+
+
+def _train(api: Api, folder: Path, console: Console) -> str:
+    """Send the capture and watch the job to its end; returns its id."""
+    capture = folder / "capture"
+    if not capture.exists():
+        write_synthetic(capture, **CAPTURE)
+    console.print(f"Capture: {capture} ({CAPTURE['frames']} frames of {CAPTURE['size']} px)")
+    query = urlencode({"preset": PRESET, "name": "synthetic scene", "config": json.dumps(OPTIONS)})
+    job = api.json(f"/jobs?{query}", _zipped(capture), "application/zip")
+    console.print(f"Job:     {api.url}{job['links']['self']}")
+    columns = (
+        TextColumn("{task.fields[phase]:>8}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TextColumn("{task.fields[facts]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("train", total=OPTIONS["iterations"], phase="waiting", facts="")
+        while not JobState(job["state"]).final:
+            time.sleep(POLL_S)
+            job = api.json(job["links"]["self"])
+            report = job["progress"]
+            if report:
+                facts = ""
+                if report["psnr"] is not None:
+                    facts = f"{report['psnr']:.1f} dB · {report['gaussians']} Gaussians"
+                progress.update(bar, completed=report["iteration"], phase=report["phase"], facts=facts)
+    if job["state"] != JobState.SUCCEEDED:
+        raise DemoError(f"the job has {job['state']}: {job['error']}. Its log: {api.url}{job['links']['log']}")
+    return str(job["id"])
+
+
+def _fetch(api: Api, job: str, folder: Path, console: Console) -> dict[str, Any]:
+    """Views from several places and times into `folder`, and the metrics; returns those."""
+    views = folder / "views"
+    views.mkdir(parents=True, exist_ok=True)
+    for name, viewpoint in VIEWPOINTS.items():
+        for t in TIMES:
+            picture = api.fetch("/render?" + urlencode({"job": job, "t": t, "format": "png", **viewpoint}))
+            (views / f"{name}_t{t:.2f}.png").write_bytes(picture)
+    metrics: dict[str, Any] = api.json(f"/jobs/{job}/metrics")
+    (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
+    (folder / "curve.svg").write_bytes(api.fetch(f"/jobs/{job}/curve.svg"))
+    console.print(f"Views:   {views} ({len(VIEWPOINTS) * len(TIMES)} files)")
+    console.print(f"Numbers: {folder / 'metrics.json'}, {folder / 'curve.svg'}")
+    return metrics
+
+
+@contextmanager
+def _service(data: Path, log: Path) -> Iterator[Api]:
+    """Service and worker as child processes, ended with the context."""
+    data.mkdir(parents=True, exist_ok=True)
+    port = _free_port()
+    command = [sys.executable, "-m", "service.commands", "--with-worker", "--exit-with-parent"]
+    command += ["--data", str(data), "--port", str(port)]
+    with log.open("ab") as output:
+        # In a session of its own: a Ctrl-C is ours to pass on.
+        child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=output, start_new_session=True)
+    try:
+        api = Api(f"http://127.0.0.1:{port}")
+        _wait_until_ready(api, child, log)
+        yield api
+    finally:
+        child.terminate()
+        child.wait()
+
+
+def _wait_until_ready(api: Api, child: subprocess.Popen[bytes], log: Path) -> None:
+    deadline = time.monotonic() + START_S
+    while time.monotonic() < deadline:
+        if child.poll() is not None:
+            raise DemoError(f"the service ended with code {child.returncode}; see {log}")
+        try:
+            api.json("/readyz")
+        except OSError:
+            time.sleep(0.2)  # not listening yet
+        else:
+            return
+    raise DemoError(f"the service did not start within {START_S:.0f} s; see {log}")
+
+
+def _free_port() -> int:
+    """The usual port, or any other where that is taken."""
+    for port in (PREFERRED_PORT, 0):
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return int(probe.getsockname()[1])
+    raise DemoError("no port is free")
+
+
+def _zipped(folder: Path) -> bytes:
+    memory = io.BytesIO()
+    # Images are compressed already.
+    with zipfile.ZipFile(memory, "w", zipfile.ZIP_STORED) as archive:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                archive.write(path, path.relative_to(folder))
+    return memory.getvalue()

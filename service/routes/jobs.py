@@ -1,0 +1,113 @@
+"""Routes of jobs: submit, look, steer, remove. Decides nothing itself: `jobs.queue` does."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+from urllib.parse import urlencode
+
+from anyio import to_thread
+from fastapi import APIRouter, Query, Request, Response
+
+from graings.config import PRESETS, make_config
+from jobs.job import ID_PATTERN, JobSpec
+from service.context import Here, JobId
+from service.problems import RESPONSES
+from service.schemas import JobPage, JobResource, job_resource
+from service.uploads import parse_config, receive_capture
+
+router = APIRouter(prefix="/jobs", tags=["jobs"], responses=RESPONSES)
+
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_FORM = {
+    "type": "object",
+    "required": ["capture"],
+    "properties": {
+        "capture": {"type": "string", "format": "binary", "description": "A zip, tar or tar.gz of the capture."},
+        "config": {"type": "string", "description": "Options as a JSON object; they win over the query's."},
+    },
+}
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "The capture: D-NeRF (transforms_*.json) or COLMAP, packed as zip, tar or tar.gz.",
+        "content": {
+            "application/zip": _BINARY,
+            "application/x-tar": _BINARY,
+            "application/gzip": _BINARY,
+            "multipart/form-data": {"schema": _FORM},
+        },
+    }
+}
+RETRY_AFTER_S = "2"
+
+
+@router.post("", status_code=202, operation_id="submit_job", openapi_extra=_BODY)
+async def submit(
+    request: Request,
+    response: Response,
+    here: Here,
+    preset: Annotated[str, Query(description=f"Where defaults come from: {', '.join(PRESETS)}.")] = "standard",
+    config: Annotated[
+        str | None, Query(description="Options as a JSON object, nested or with dotted keys, see /options.")
+    ] = None,
+    priority: Annotated[int, Query(ge=1, le=1_000_000, description="Jobs with a lower number start first.")] = 10,
+    name: Annotated[
+        str, Query(min_length=1, max_length=120, description="For people to recognise the job.")
+    ] = "untitled",
+) -> JobResource:
+    """Queue a training job on the capture in the body, sent as it is or as `capture` of a multipart form."""
+    overrides = {} if config is None else parse_config(config, "config")
+    # Once before the body is read: nobody should upload gigabytes to hear of a typing mistake.
+    make_config(preset, overrides)
+    async with receive_capture(request, here.store.uploads, here.limits) as upload:
+        chosen = make_config(preset, {**overrides, **upload.config})
+        spec = JobSpec(name=name, capture=upload.digest, config=chosen.model_dump(mode="json"), priority=priority)
+        job = await to_thread.run_sync(here.jobs.submit, spec, upload.folder)
+    response.headers["Location"] = f"/jobs/{job.id}"
+    response.headers["Retry-After"] = RETRY_AFTER_S
+    return job_resource(job)
+
+
+@router.get("", operation_id="list_jobs")
+def page(
+    here: Here,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+    cursor: Annotated[str | None, Query(pattern=ID_PATTERN, description="From `next` of the page before.")] = None,
+) -> JobPage:
+    """Jobs, newest first."""
+    jobs, after = here.jobs.page(limit, cursor)
+    following = None if after is None else "/jobs?" + urlencode({"limit": limit, "cursor": after})
+    return JobPage(jobs=[job_resource(job) for job in jobs], next=following)
+
+
+@router.get("/{job_id}", operation_id="get_job")
+def get(job_id: JobId, response: Response, here: Here) -> JobResource:
+    """A job with its state and progress."""
+    job = here.jobs.get(job_id)
+    if not job.state.final:
+        response.headers["Retry-After"] = RETRY_AFTER_S
+    return job_resource(job)
+
+
+@router.post("/{job_id}/cancel", status_code=202, operation_id="cancel_job")
+def cancel(job_id: JobId, here: Here) -> JobResource:
+    """Stop a job; it keeps a checkpoint to resume from. Cancelling it again changes nothing."""
+    return job_resource(here.jobs.cancel(job_id))
+
+
+@router.post("/{job_id}/resume", status_code=202, operation_id="resume_job")
+def resume(job_id: JobId, here: Here) -> JobResource:
+    """Queue a cancelled job again; it continues where it stopped. Resuming it again changes nothing."""
+    return job_resource(here.jobs.resume(job_id))
+
+
+@router.post("/{job_id}/retry", status_code=202, operation_id="retry_job")
+def retry(job_id: JobId, here: Here) -> JobResource:
+    """Queue a failed or diverged job again; it continues from its last checkpoint, if any."""
+    return job_resource(here.jobs.retry(job_id))
+
+
+@router.delete("/{job_id}", status_code=204, operation_id="delete_job")
+def delete(job_id: JobId, here: Here) -> None:
+    """Remove a job with its model, log and metrics; its capture too when no other job uses it."""
+    here.jobs.delete(job_id)

@@ -1,0 +1,95 @@
+"""Routes of what a job leaves: metrics, curve, log, and its progress as a stream of events."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Annotated
+
+from anyio import sleep, to_thread
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+
+from jobs.job import Job, JobNotFound, JobState
+from jobs.progress import last_start, read_progress
+from service.context import Here, JobId
+from service.problems import RESPONSES, NotYet
+from service.schemas import job_resource
+
+router = APIRouter(prefix="/jobs/{job_id}", tags=["results"], responses=RESPONSES)
+
+POLL_S = 0.5
+RECONNECT_MS = 2_000
+_MAX_LOG = 4 << 20
+
+
+@router.get("/metrics", operation_id="get_metrics", response_class=Response)
+def metrics(job_id: JobId, here: Here) -> Response:
+    """The metrics document, schema `graings.metrics/1`; it grows with every evaluation."""
+    path = _existing(here.store.folder(job_id).metrics, "metrics", "They come with the first evaluation.")
+    return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
+
+
+@router.get("/curve.svg", operation_id="get_curve", response_class=FileResponse)
+def curve(job_id: JobId, here: Here) -> Response:
+    """Held-out error against training time, as a picture."""
+    path = _existing(here.store.folder(job_id).curve, "curve", "It comes with the first evaluation.")
+    return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
+
+
+@router.get("/log", operation_id="get_log", response_class=PlainTextResponse)
+def log(job_id: JobId, here: Here, tail: Annotated[int, Query(ge=1, le=100_000)] = 1_000) -> Response:
+    """The last `tail` lines of the trainer's log."""
+    path = here.store.folder(job_id).log
+    if not path.exists():
+        return PlainTextResponse("")
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _MAX_LOG))
+        lines = file.read().splitlines(keepends=True)
+    return PlainTextResponse(b"".join(lines[-tail:]).decode("utf-8", "replace"))
+
+
+def _known(job_id: JobId, here: Here) -> Job:
+    """Looked up before the stream begins: afterwards it is too late for a 404."""
+    return here.jobs.get(job_id)
+
+
+@router.get("/events", operation_id="get_events", response_class=EventSourceResponse)
+async def events(
+    request: Request,
+    here: Here,
+    job: Annotated[Job, Depends(_known)],
+    last_event_id: Annotated[
+        int | None, Header(ge=0, description="Go on after this event; 0 starts at the first report.")
+    ] = None,
+) -> AsyncIterator[ServerSentEvent]:
+    """`progress` (the trainer's reports), `state` (the job, whenever its state changes) and, last of all, `end`.
+
+    Without Last-Event-ID the stream starts with the newest report.
+    """
+    path = here.store.folder(job.id).progress
+    position = last_event_id if last_event_id is not None else await to_thread.run_sync(last_start, path)
+    state: JobState | None = None
+    while not await request.is_disconnected():
+        try:
+            # State first: what was reported before the end is then surely read below.
+            job = await to_thread.run_sync(here.jobs.get, job.id)
+        except JobNotFound:
+            return  # deleted while we watched
+        lines, position = await to_thread.run_sync(read_progress, path, position)
+        for place, report in lines:
+            yield ServerSentEvent(event="progress", id=str(place), data=report, retry=RECONNECT_MS)
+        if job.state is not state:
+            state = job.state
+            yield ServerSentEvent(event="state", data=job_resource(job))
+        if state.final:
+            yield ServerSentEvent(event="end", data=job_resource(job))
+            return
+        await sleep(POLL_S)
+
+
+def _existing(path: Path, what: str, when: str) -> Path:
+    if not path.exists():
+        raise NotYet(f"This job has no {what} yet. {when}")
+    return path

@@ -1,0 +1,108 @@
+"""Scenes: loaded models and the pool that draws them.
+
+Models are kept by what their checkpoint holds, the least recently used one leaves; images are drawn in a few threads,
+and who finds too many waiting is turned away at once. Knows nothing of HTTP.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from anyio import CapacityLimiter, to_thread
+
+from graings.camera import Camera
+from graings.checkpoint import Model, load_model, newest_checkpoint
+from graings.encode import ImageFormat, encode_image
+from graings.errors import CheckpointError
+from graings.render import render
+from service.problems import Busy
+
+_Key = tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """Everything that decides what an image looks like, but for the model. `time` in [0, 1]."""
+
+    camera: Camera
+    time: float
+    background: tuple[float, float, float]
+    format: ImageFormat
+
+
+class Scenes:
+    """The models in memory, at most `models` of them. `load` may be called from several threads."""
+
+    def __init__(self, models: int) -> None:
+        self._models = models
+        self._loaded: OrderedDict[_Key, Model] = OrderedDict()
+        self._guard = threading.Lock()
+
+    def load(self, run: Path) -> Model | None:
+        """The model in the newest checkpoint of a run folder, or None. Raises `CheckpointError`."""
+        # One at a time: two requests for the same new checkpoint should read it once.
+        with self._guard:
+            checkpoint = newest_checkpoint(run)
+            if checkpoint is None:
+                return None
+            key = _key(checkpoint)
+            model = self._loaded.get(key) if key else None
+            if model is None:
+                try:
+                    model = load_model(checkpoint)
+                except CheckpointError:
+                    newer = newest_checkpoint(run)
+                    if newer == checkpoint:
+                        raise
+                    # Training went on and removed this one while it was read.
+                    model = load_model(newer or run)
+                key = _key(model.path)
+                if key:
+                    self._forget(model.path.parent)
+                    self._loaded[key] = model
+            if key:
+                self._loaded.move_to_end(key)
+            while len(self._loaded) > self._models:
+                self._loaded.popitem(last=False)
+            return model
+
+    def _forget(self, checkpoints: Path) -> None:
+        """Older checkpoints of the same run are not asked for again."""
+        for key in [key for key in self._loaded if Path(key[0]).parent == checkpoints]:
+            del self._loaded[key]
+
+
+class RenderPool:
+    """Draws images, `slots` at a time; at most `waiting` more may wait."""
+
+    def __init__(self, slots: int, waiting: int, threads: int) -> None:
+        self._limiter = CapacityLimiter(slots)
+        self._most = slots + waiting
+        self._inside = 0
+        self._threads = threads
+
+    async def draw(self, model: Model, picture: Picture) -> bytes:
+        """The encoded image. Raises `Busy`."""
+        if self._inside >= self._most:
+            raise Busy("Too many images are being rendered. Try again in a moment.")
+        self._inside += 1
+        try:
+            return await to_thread.run_sync(self._draw, model, picture, limiter=self._limiter)
+        finally:
+            self._inside -= 1
+
+    def _draw(self, model: Model, picture: Picture) -> bytes:
+        result = render(model.scene, picture.camera, picture.time, picture.background, threads=self._threads)
+        return encode_image(np.asarray(result.color, dtype=np.float32), picture.format)
+
+
+def _key(checkpoint: Path) -> _Key | None:
+    """What tells this checkpoint from any other that is or was in its place; None when it is gone."""
+    try:
+        return str(checkpoint), checkpoint.stat().st_mtime_ns
+    except FileNotFoundError:
+        return None

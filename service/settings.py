@@ -1,0 +1,56 @@
+"""Settings: what an operator may choose about the service.
+
+Every field can be given as an environment variable `GRAINGS_<FIELD>`. Knows nothing of how they are used.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from graings.errors import ConfigError
+from jobs.commands import default_database
+
+PREFIX = "GRAINGS_"
+
+
+class Settings(BaseModel):
+    """Settings of one API process."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    data: Path = Field(Path("data"), description="Folder with captures and jobs.")
+    database: str | None = Field(None, description="sqlite:///… or postgresql://…; null: SQLite in the data folder.")
+    host: str = Field("127.0.0.1", description="Address to listen on. There is no authentication: keep it local.")
+    port: int = Field(8000, ge=0, le=65535, description="Port to listen on.")
+    max_upload_mb: int = Field(4_096, ge=1, description="Largest archive that is accepted.")
+    max_unpacked_mb: int = Field(16_384, ge=1, description="Largest capture that an archive may unpack to.")
+    max_files: int = Field(20_000, ge=1, description="Most files in an archive.")
+    min_free_mb: int = Field(512, ge=0, description="Free disk space below which the service is not ready.")
+    models: int = Field(4, ge=1, le=256, description="Loaded models that are kept in memory.")
+    render_slots: int = Field(1, ge=1, le=64, description="Images rendered at the same time.")
+    render_waiting: int = Field(16, ge=0, le=1_000, description="Requests that may wait for a slot; more get 503.")
+    render_threads: int = Field(1, ge=1, le=256, description="CPU threads per image.")
+
+    @property
+    def database_url(self) -> str:
+        """The database, the default filled in."""
+        return self.database or default_database(self.data)
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] = os.environ, **given: object) -> Settings:
+        """Settings from the environment; what is `given` and not None wins. Raises `ConfigError`."""
+        values: dict[str, object] = {
+            name: environment[PREFIX + name.upper()]
+            for name in cls.model_fields
+            if PREFIX + name.upper() in environment
+        }
+        values |= {name: value for name, value in given.items() if value is not None}
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            problems = "; ".join(f"{PREFIX}{str(e['loc'][0]).upper()}: {e['msg']}" for e in error.errors())
+            raise ConfigError(f"{problems}. See the settings in the documentation.") from error

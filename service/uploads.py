@@ -1,0 +1,105 @@
+"""Uploads: from a request body to an unpacked capture.
+
+The body is written to disk as it arrives, hashed on the way, and unpacked beside it; nothing stays behind when
+anything goes wrong. Knows nothing of jobs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import uuid
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from anyio import open_file, to_thread
+from starlette.datastructures import FormData, UploadFile
+from starlette.requests import Request
+
+from service.archives import Limits, unpack
+from service.problems import BadRequest
+
+_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """A capture that arrived: where it was unpacked, the archive's sha256, and the options sent along with it."""
+
+    folder: Path
+    digest: str
+    config: dict[str, Any]
+
+
+@asynccontextmanager
+async def receive_capture(request: Request, uploads: Path, limits: Limits) -> AsyncIterator[Upload]:
+    """The capture in a request's body, which is an archive or a multipart form with one.
+
+    `folder` lasts as long as the context unless it is moved away. Raises `ArchiveError` and `BadRequest`.
+    """
+    name = uuid.uuid4().hex
+    archive, folder = uploads / f"{name}.part", uploads / name
+    try:
+        if request.headers.get("content-type", "").startswith("multipart/form-data"):
+            async with request.form(max_files=1, max_fields=1) as form:
+                config = _config_field(form)
+                digest = await _store_file(_capture_field(form), archive)
+        else:
+            config, digest = {}, await _store_stream(request, archive)
+        await to_thread.run_sync(unpack, archive, folder, limits)
+        archive.unlink()
+        yield Upload(folder, digest, config)
+    finally:
+        archive.unlink(missing_ok=True)
+        await to_thread.run_sync(lambda: shutil.rmtree(folder, ignore_errors=True))
+
+
+def parse_config(text: str, where: str) -> dict[str, Any]:
+    """A JSON object of options. Raises `BadRequest` naming `where` it was given."""
+    try:
+        value = json.loads(text, parse_constant=_refuse_constant)
+    except ValueError as error:
+        raise BadRequest(f"{where}: not JSON ({error}). Give an object of options, see /options.") from error
+    if not isinstance(value, dict):
+        raise BadRequest(f"{where}: must be a JSON object of options, see /options.")
+    return value
+
+
+async def _store_stream(request: Request, archive: Path) -> str:
+    digest = hashlib.sha256()
+    async with await open_file(archive, "xb") as file:
+        async for chunk in request.stream():
+            digest.update(chunk)
+            await file.write(chunk)
+    return digest.hexdigest()
+
+
+async def _store_file(upload: UploadFile, archive: Path) -> str:
+    digest = hashlib.sha256()
+    async with await open_file(archive, "xb") as file:
+        while chunk := await upload.read(_CHUNK):
+            digest.update(chunk)
+            await file.write(chunk)
+    return digest.hexdigest()
+
+
+def _capture_field(form: FormData) -> UploadFile:
+    value = form.get("capture")
+    if not isinstance(value, UploadFile):
+        raise BadRequest("capture: the form has no file of that name. Send the archive as the file field `capture`.")
+    return value
+
+
+def _config_field(form: FormData) -> dict[str, Any]:
+    value = form.get("config", "{}")
+    if not isinstance(value, str):
+        raise BadRequest("config: must be a text field with a JSON object of options.")
+    return parse_config(value, "config")
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is not a JSON number")

@@ -1,0 +1,383 @@
+// The page: jobs on the left, the scene in the middle, one job's numbers on the right. It keeps no truth of its own:
+// everything it shows comes from the REST interface beside it.
+
+const $ = (id) => document.getElementById(id);
+const RENDER_SIDE = 512;
+const DRAFT_SIDE = 256; // while something moves
+const LIST_EVERY_MS = 4000;
+const PLAY_SECONDS = 4;
+
+const known = new Map(); // job resources by id
+let pages = 1;
+let current = null; // id of the job in the middle
+let stream = null;
+
+// ---- talking to the service
+
+async function ask(path, options) {
+  const answer = await fetch(path, options);
+  if (answer.status === 204) return null;
+  const body = await answer.json();
+  if (!answer.ok) throw new Error(body.detail || body.title || answer.statusText);
+  return body;
+}
+
+// ---- jobs
+
+async function list() {
+  const found = [];
+  let path = "/jobs?limit=20";
+  for (let page = 0; page < pages && path; page++) {
+    const answer = await ask(path);
+    found.push(...answer.jobs);
+    path = answer.next;
+  }
+  $("more").hidden = !path;
+  known.clear();
+  for (const job of found) known.set(job.id, job);
+  draw();
+  if (current === null) {
+    const first = found.find((job) => job.checkpoint !== null) || found[0];
+    if (first) choose(first.id);
+  } else if (known.has(current)) {
+    facts(known.get(current));
+  }
+}
+
+function draw() {
+  const rows = [...known.values()].map((job) => {
+    const button = element("button", { type: "button", "aria-current": String(job.id === current) });
+    const top = element("span", { class: "top" });
+    top.append(element("span", { class: "title" }, job.name), element("span", { class: `state ${job.state}` }, job.state));
+    button.append(top);
+    const report = job.progress;
+    if (report && (job.state === "running" || job.state === "cancelled")) {
+      button.append(element("progress", { max: report.iterations, value: report.iteration, "aria-label": "Progress" }));
+    }
+    button.append(element("span", { class: "sub" }, summary(job)));
+    button.onclick = () => choose(job.id);
+    const row = element("li");
+    row.append(button);
+    return row;
+  });
+  $("jobs").replaceChildren(...rows);
+}
+
+function summary(job) {
+  const report = job.progress;
+  if (job.state === "queued") return report ? `waiting, goes on from ${count(job.checkpoint || 0)}` : "waiting for a worker";
+  if (!report) return ago(job.created_at);
+  const done = `${count(report.iteration)} of ${count(report.iterations)}`;
+  if (job.state !== "running") return `${done} · ${ago(job.finished_at || job.created_at)}`;
+  if (report.phase === "loading") return "loading the capture";
+  return report.eta_s === null ? done : `${done} · ${span(report.eta_s)} left`;
+}
+
+function choose(id) {
+  const other = current !== id;
+  current = id;
+  draw();
+  facts(known.get(id));
+  if (other) {
+    Object.assign(orbit, START);
+    look();
+    follow(id);
+  }
+}
+
+function follow(id) {
+  stream?.close();
+  stream = new EventSource(`/jobs/${id}/events`);
+  const update = (job) => {
+    const before = known.get(id);
+    known.set(id, job);
+    draw();
+    facts(job);
+    if (!before || before.checkpoint !== job.checkpoint) look();
+  };
+  let refreshed = Date.now();
+  stream.addEventListener("progress", (event) => {
+    const job = known.get(id);
+    if (!job) return;
+    const report = JSON.parse(event.data);
+    const held = report.held_out_psnr ?? job.progress?.held_out_psnr ?? null;
+    update({ ...job, progress: { ...report, held_out_psnr: held } });
+    if (Date.now() - refreshed > LIST_EVERY_MS) {
+      refreshed = Date.now();
+      ask(`/jobs/${id}`).then((fresh) => current === id && update({ ...fresh, progress: known.get(id).progress }), complain);
+    }
+  });
+  stream.addEventListener("state", (event) => update(JSON.parse(event.data)));
+  stream.addEventListener("end", (event) => {
+    update(JSON.parse(event.data));
+    stream.close();
+  });
+}
+
+function facts(job) {
+  $("facts").hidden = !job;
+  if (!job) return;
+  const report = job.progress || {};
+  const rows = [
+    ["State", job.state],
+    ["Iterations", report.iterations && `${count(report.iteration)} of ${count(report.iterations)}`],
+    ["Phase", job.state === "running" && report.phase],
+    ["Speed", job.state === "running" && report.iterations_per_s && `${report.iterations_per_s.toFixed(1)} it/s`],
+    ["Time left", job.state === "running" && report.eta_s != null && span(report.eta_s)],
+    ["Trained for", report.train_s != null && span(report.train_s)],
+    ["Training view", report.psnr != null && `${report.psnr.toFixed(2)} dB`],
+    ["Held-out views", report.held_out_psnr != null && `${report.held_out_psnr.toFixed(2)} dB`],
+    ["Gaussians drawn", report.gaussians != null && count(report.gaussians)],
+    ["Anchors", report.anchors != null && count(report.anchors)],
+    ["Attempts", job.attempts > 1 && job.attempts],
+  ].filter(([, value]) => value);
+  $("name").textContent = job.name;
+  $("error").hidden = !job.error;
+  $("error").textContent = job.error || "";
+  $("numbers").replaceChildren(...rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]));
+
+  const verbs = ["cancel", "resume", "retry"].filter((verb) => job.links[verb]);
+  const buttons = verbs.map((verb) => action(verb, () => ask(job.links[verb], { method: "POST" })));
+  if (job.state !== "running") {
+    buttons.push(action("delete", async () => {
+      if (!confirm(`Delete "${job.name}" with its model?`)) return;
+      await ask(job.links.self, { method: "DELETE" });
+      known.delete(job.id);
+      stream?.close();
+      current = null;
+    }));
+  }
+  if ($("actions").dataset.verbs !== `${job.id} ${job.state}`) {
+    $("actions").dataset.verbs = `${job.id} ${job.state}`;
+    $("actions").replaceChildren(...buttons);
+  }
+  const curve = $("curve");
+  const stamp = `${job.links.curve}?${Math.floor(report.train_s / 10)} ${job.state}`;
+  curve.hidden = !job.links.curve;
+  if (job.links.curve && curve.dataset.stamp !== stamp) {
+    curve.dataset.stamp = stamp;
+    curve.src = `${job.links.curve}?at=${Date.now()}`;
+  }
+  const names = { metrics: "metrics.json", log: "log" };
+  $("files").replaceChildren(
+    ...Object.entries(names).filter(([key]) => job.links[key]).map(([key, text]) => element("a", { href: job.links[key] }, text)),
+  );
+}
+
+function action(verb, go) {
+  const button = element("button", { type: "button", class: "quiet" }, verb[0].toUpperCase() + verb.slice(1));
+  button.onclick = async () => {
+    button.disabled = true;
+    try {
+      await go();
+      $("actions").dataset.verbs = "";
+      await list();
+      if (current && known.get(current)) follow(current);
+    } catch (error) {
+      complain(error);
+    }
+    button.disabled = false;
+  };
+  return button;
+}
+
+// ---- the view: one request at a time, the latest wish next
+
+const START = { azimuth: 30, elevation: null, zoom: 1, radius: null };
+const orbit = { ...START };
+let busy = false;
+let wish = null;
+let settle = 0;
+
+function look(side = RENDER_SIDE) {
+  const job = known.get(current);
+  if (!job || job.checkpoint === null) {
+    $("view").hidden = true;
+    $("empty").hidden = false;
+    $("caption").textContent = "";
+    $("time").disabled = $("play").disabled = true;
+    return;
+  }
+  $("time").disabled = $("play").disabled = false;
+  const query = new URLSearchParams({ job: job.id, t: $("time").value, width: side, height: side, format: "jpeg" });
+  query.set("azimuth", orbit.azimuth.toFixed(2));
+  if (orbit.elevation !== null) query.set("elevation", orbit.elevation.toFixed(2));
+  if (orbit.zoom !== 1 && orbit.radius !== null) query.set("radius", (orbit.radius * orbit.zoom).toPrecision(6));
+  wish = `/render?${query}`;
+  if (side !== RENDER_SIDE) {
+    clearTimeout(settle);
+    settle = setTimeout(look, 250); // sharp again once the hand rests
+  }
+  if (!busy) fetchView();
+}
+
+async function fetchView() {
+  busy = true;
+  while (wish !== null) {
+    const address = wish;
+    wish = null;
+    try {
+      const answer = await fetch(address);
+      if (!answer.ok) throw new Error((await answer.json()).detail);
+      const image = $("view");
+      const old = image.src;
+      image.src = URL.createObjectURL(await answer.blob());
+      await image.decode();
+      URL.revokeObjectURL(old);
+      image.hidden = false;
+      $("empty").hidden = true;
+      const [, elevation, radius] = answer.headers.get("X-Graings-Orbit").split(" ").map(Number);
+      orbit.radius ??= radius;
+      orbit.shown = elevation;
+      const finished = answer.headers.get("X-Graings-Finished") === "true";
+      $("caption").textContent = finished ? "" : `iteration ${count(Number(answer.headers.get("X-Graings-Iteration")))}, still training`;
+    } catch (error) {
+      complain(error);
+      await new Promise((resolve) => setTimeout(resolve, 500));
+    }
+  }
+  busy = false;
+}
+
+$("view").onpointerdown = (event) => {
+  event.target.setPointerCapture(event.pointerId);
+  event.target.classList.add("held");
+};
+$("view").onpointermove = (event) => {
+  if (!event.buttons) return;
+  orbit.azimuth = (orbit.azimuth - event.movementX * 0.5) % 360;
+  orbit.elevation = Math.max(-89, Math.min(89, (orbit.elevation ?? orbit.shown ?? 20) + event.movementY * 0.4));
+  look(DRAFT_SIDE);
+};
+$("view").onpointerup = (event) => {
+  event.target.classList.remove("held");
+  look();
+};
+$("view").ondblclick = () => {
+  Object.assign(orbit, START);
+  look();
+};
+$("frame").addEventListener("wheel", (event) => {
+  event.preventDefault();
+  orbit.zoom = Math.max(0.2, Math.min(5, orbit.zoom * Math.exp(event.deltaY * 0.001)));
+  look(DRAFT_SIDE);
+}, { passive: false });
+
+let playing = null;
+function setTime(t) {
+  $("time").value = t;
+  $("clock").value = Number($("time").value).toFixed(3);
+  look(playing === null ? RENDER_SIDE : DRAFT_SIDE);
+}
+$("time").oninput = () => {
+  $("clock").value = Number($("time").value).toFixed(3);
+  look(DRAFT_SIDE);
+};
+$("play").onclick = () => {
+  const on = playing === null;
+  $("play").textContent = on ? "❚❚" : "▶";
+  $("play").setAttribute("aria-pressed", String(on));
+  if (!on) {
+    cancelAnimationFrame(playing);
+    playing = null;
+    look();
+    return;
+  }
+  let before = performance.now();
+  const step = (now) => {
+    playing = requestAnimationFrame(step);
+    if (busy) return; // as fast as it is drawn
+    setTime((Number($("time").value) + (now - before) / 1000 / PLAY_SECONDS) % 1);
+    before = now;
+  };
+  playing = requestAnimationFrame(step);
+};
+
+// ---- sending a capture
+
+const form = $("upload");
+const file = form.elements.capture;
+file.onchange = () => ($("chosen").textContent = file.files[0]?.name || "Drop a capture here, or choose a zip or tar");
+for (const name of ["dragover", "dragleave", "drop"]) {
+  $("drop").addEventListener(name, (event) => {
+    event.preventDefault();
+    $("drop").classList.toggle("over", name === "dragover");
+    if (name === "drop") {
+      file.files = event.dataTransfer.files;
+      file.onchange();
+    }
+  });
+}
+form.onsubmit = (event) => {
+  event.preventDefault();
+  const capture = file.files[0];
+  const query = new URLSearchParams({ preset: form.elements.preset.value, name: capture.name.replace(/\.(zip|tar|tgz|tar\.gz)$/i, "") });
+  if (form.elements.config.value.trim()) query.set("config", form.elements.config.value);
+  const request = new XMLHttpRequest(); // fetch does not tell how much it has sent
+  request.open("POST", `/jobs?${query}`);
+  request.setRequestHeader("Content-Type", "application/octet-stream");
+  request.responseType = "json";
+  request.upload.onprogress = (progress) => ($("sending").value = progress.loaded / progress.total);
+  request.onloadend = () => {
+    $("sending").hidden = true;
+    if (request.status === 202) {
+      form.reset();
+      file.onchange();
+      list().then(() => choose(request.response.id), complain);
+    } else {
+      $("refused").hidden = false;
+      $("refused").textContent = request.response?.detail || "The service did not answer.";
+    }
+  };
+  $("refused").hidden = true;
+  $("sending").hidden = false;
+  request.send(capture);
+};
+
+// ---- small things
+
+function element(name, attributes = {}, text = null) {
+  const made = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text !== null) made.textContent = text;
+  return made;
+}
+
+const count = (number) => Math.round(number).toLocaleString("en").replaceAll(",", " ");
+
+function span(seconds) {
+  if (seconds < 60) return `${Math.round(seconds)} s`;
+  if (seconds < 3600) return `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`;
+  return `${Math.floor(seconds / 3600)} h ${Math.round((seconds % 3600) / 60)} min`;
+}
+
+function ago(moment) {
+  const seconds = (Date.now() - new Date(moment)) / 1000;
+  return seconds < 5 ? "just now" : `${span(seconds).replace(/ \d+ (s|min)$/, "")} ago`;
+}
+
+function complain(error) {
+  $("health").textContent = error.message;
+}
+
+async function health() {
+  const found = await ask("/readyz");
+  const workers = found.workers === 1 ? "1 worker" : `${found.workers} workers`;
+  $("health").textContent = found.workers ? workers : "No worker: jobs wait. Start one with graings worker.";
+}
+
+async function refresh() {
+  try {
+    await health();
+    await list();
+  } catch (error) {
+    complain(error);
+  }
+  setTimeout(refresh, LIST_EVERY_MS);
+}
+
+$("more").onclick = () => {
+  pages += 1;
+  list().catch(complain);
+};
+refresh();
