@@ -20,7 +20,7 @@ from graings.capture.folder import CaptureFolder
 from graings.capture.image_file import ImageFile
 from graings.capture.json_document import parse_json
 from graings.capture.lens import Lens
-from graings.capture.recording import Recording, Shot
+from graings.capture.recording import FARTHEST, Recording, Shot
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
 
@@ -56,9 +56,9 @@ def read_colmap(folder: CaptureFolder, config: CaptureConfig) -> Recording:
     notes: list[str] = []
     shots = _shots(folder, where, model, _times(folder, config, model), notes)
     splits = _split(folder, where, shots, config.test_every, notes)
-    finite = np.asarray(np.isfinite(model.positions).all(axis=1))
+    finite = np.asarray((np.abs(model.positions) <= FARTHEST).all(axis=1))  # False for NaN as well
     if not finite.all():
-        notes.append(f"{int((~finite).sum())} of {len(finite)} points are not finite and left out")
+        notes.append(f"{int((~finite).sum())} of {len(finite)} points are not finite or absurdly far and left out")
     if not finite.any():
         return Recording("colmap", splits, tuple(notes))
     return Recording("colmap", splits, tuple(notes), model.positions[finite], model.colors[finite])

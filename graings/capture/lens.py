@@ -49,16 +49,25 @@ class Lens:
         camera = _camera(model, params, size)
         flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
         fx, fy, cx, cy = (float(value) for value in flat.params)
-        return Lens(model, params, size, (fx, fy, cx, cy), (flat.width, flat.height))
+        lens = Lens(model, params, size, (fx, fy, cx, cy), (flat.width, flat.height))
+        # pycolmap answers for any numbers: what it promises, no blank borders, is what absurd ones break.
+        share = np.arange(33) / 32
+        probe = lens._photograph(0.5 + share * (flat.width - 1), 0.5 + share * (flat.height - 1))
+        if not ((probe > -1.0) & (probe < np.array(size) + 1.0)).all():  # False for NaN as well
+            raise ValueError("its undistorted picture reaches outside the photograph")
+        return lens
 
     def source_pixels(self) -> NDArray[np.float64]:
         """Where each undistorted pixel centre lies in the photograph, [H, W, 2] (x, y)."""
         width, height = self.pinhole_size
+        return self._photograph(np.arange(width) + 0.5, np.arange(height) + 0.5)
+
+    def _photograph(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
         fx, fy, cx, cy = self.pinhole
-        x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
+        x, y = np.meshgrid((u - cx) / fx, (v - cy) / fy)
         rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
         pixels = _camera(self.model, self.params, self.size).img_from_cam(rays)
-        return np.asarray(pixels, dtype=np.float64).reshape(height, width, 2)
+        return np.asarray(pixels, dtype=np.float64).reshape(len(v), len(u), 2)
 
     def undistort(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """`image` [H, W, C] at `size`, sampled bilinearly at `source_pixels`; premultiplied alpha is expected."""
@@ -66,8 +75,6 @@ class Lens:
         if image.shape[:2] != (height, width):
             raise ValueError(f"image must be {width}x{height}, got {image.shape[1]}x{image.shape[0]}")
         at = self.source_pixels() - 0.5
-        if not np.isfinite(at).all():
-            raise ValueError(f"{self.model} with {self.params} has no image for part of its own view")
         x, y = np.clip(at, 0.0, (width - 1.0, height - 1.0)).reshape(-1, 2).T
         left, top = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
         # At the last row and column the weight of the next one is zero: any pixel will do.

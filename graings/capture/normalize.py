@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from graings.camera import Camera
 from graings.capture.capture import SPLITS, Capture, Frame, PointCloud
-from graings.capture.recording import Recording, Shot
+from graings.capture.recording import FARTHEST, Recording, Shot
+from graings.errors import CaptureError
 from graings.units import Units
 
 Array = NDArray[np.float64]
@@ -33,10 +34,19 @@ NEARLY_AXIS = math.cos(math.radians(10.0))
 def normalize(recording: Recording, *, root: Path, max_side: int | None, content_hash: str) -> Capture:
     """The capture in normalised units, its cameras reduced to `max_side` px."""
     notes = list(recording.notes)
+    shots = [shot for split in SPLITS for shot in recording.splits[split]]
+    for shot in shots:
+        for field, size in (("camera position", np.abs(shot.camera.center).max()), ("time", abs(shot.time or 0.0))):
+            if size > FARTHEST:
+                raise CaptureError(
+                    f"is {size:.3g}; nothing beyond {FARTHEST:g} is taken",
+                    file=shot.image.name,
+                    field=field,
+                    remedy="Correct it in the file that lists the image.",
+                )
     cameras = [shot.camera for shot in recording.splits["train"]]
     center, scale, found = frame_of_reference(cameras, recording.positions)
     notes += found
-    shots = [shot for split in SPLITS for shot in recording.splits[split]]
     instants = _instants([shot.time for shot in shots if shot.time is not None])
     stamps = sorted(set(instants.values()))
     if not stamps:

@@ -6,7 +6,7 @@ Plain data between the readers and `graings.capture.normalize`. Knows nothing of
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from graings.camera import Camera
 from graings.capture.capture import Split
 from graings.capture.image_file import ImageFile
 from graings.capture.lens import Lens
+
+# Larger lengths or times leave no room to compute with them: they are slips of the file.
+FARTHEST: Final = 1e15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
