@@ -149,20 +149,23 @@ class _LogAxis:
     low: float
     high: float
     left: float
+    ends: tuple[float, ...]  # the extreme values themselves
 
     @staticmethod
     def over(values: Sequence[float], left: float) -> _LogAxis:
         smallest = min((value for value in values if value > 0), default=1.0)
-        low, high = math.log(smallest), math.log(max(*values, smallest))
-        air = max(0.04 * (high - low), 0.0 if high > low else 1.0)
-        return _LogAxis(low - air, high + air, left)
+        largest = max(*values, smallest)
+        low, high = math.log(smallest), math.log(largest)
+        air = 0.04 * (high - low) if high > low else 1.0
+        ends = (smallest, largest) if high > low else (smallest,)
+        return _LogAxis(low - air, high + air, left, ends)
 
     def at(self, value: float) -> float:
         """Position in pixels; what lies below the axis (such as 0 seconds) sits at its start."""
         share = (math.log(value) - self.low) / (self.high - self.low) if value > 0 else 0.0
         return self.left + PANEL * max(share, 0.0)
 
-    def ticks(self, welcome: Sequence[float]) -> list[float]:
+    def ticks(self, welcome: Sequence[float]) -> Sequence[float]:
         """Round numbers on this axis that leave room for their labels."""
         chosen: list[float] = []
         for value in welcome:
@@ -170,7 +173,7 @@ class _LogAxis:
             if inside and all(abs(self.at(value) - self.at(other)) >= LABEL_ROOM for other in chosen):
                 chosen.append(value)
         if len(chosen) < 2:  # a range so short that it holds no round numbers: name its ends
-            return [math.exp(end) for end in sorted({self.low, self.high})]
+            return self.ends
         return chosen
 
 
