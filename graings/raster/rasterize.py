@@ -17,7 +17,7 @@ from graings.camera import Camera
 from graings.gaussians import Gaussians
 from graings.raster.arguments import check_arguments
 from graings.raster.kernel import kernel
-from graings.raster.result import RasterSettings, RenderResult
+from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 
 
 def rasterize(
@@ -26,7 +26,7 @@ def rasterize(
     background: Tensor,
     *,
     means2d_offset: Tensor | None = None,
-    settings: RasterSettings = RasterSettings(),
+    settings: RasterSettings = DEFAULT_SETTINGS,
     threads: int | None = None,
 ) -> RenderResult:
     """Draw `gaussians` seen by `camera` on `background` [3] (RGB, same dtype); Eq. (1) and (2).

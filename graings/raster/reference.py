@@ -19,7 +19,7 @@ from graings.camera import Camera
 from graings.constants import TILE
 from graings.gaussians import Gaussians
 from graings.raster.arguments import check_arguments
-from graings.raster.result import RasterSettings, RenderResult
+from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 
 # Elements of one [pixel, gaussian] matrix: a dozen of them in float64 live at once, about 100 MB.
 CHUNK_ELEMENTS = 1 << 20
@@ -50,7 +50,7 @@ def rasterize(
     background: Tensor,
     *,
     means2d_offset: Tensor | None = None,
-    settings: RasterSettings = RasterSettings(),
+    settings: RasterSettings = DEFAULT_SETTINGS,
     threads: int | None = None,
 ) -> RenderResult:
     """Draw `gaussians` seen by `camera` on `background` [3]; same contract as `graings.raster.rasterize`.

@@ -31,6 +31,9 @@ class RasterSettings:
     compat: bool = False
 
 
+DEFAULT_SETTINGS = RasterSettings()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderResult:
     """One rendered view; images are [height, width, ...] in the dtype of the Gaussians.

@@ -1,10 +1,12 @@
 // The Python face of the kernel. Arrays come in through DLPack; nothing here knows torch.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <optional>
 #include <stdexcept>
 #include <string>
 
@@ -25,17 +27,17 @@ auto* checked(const Array& array, size_t size, const char* name) {
         throw std::invalid_argument(std::string(name) + " must have " + std::to_string(size) + " elements, got " + std::to_string(array.size()));
     return array.data();
 }
-template <class T, class Array>
-T* optional(nb::handle object, size_t size, const char* name) {
-    return object.is_none() ? nullptr : checked(nb::cast<Array>(object, false), size, name);
+template <class Array>
+auto* checked(const std::optional<Array>& array, size_t size, const char* name) {
+    return array ? checked(*array, size, name) : nullptr;
 }
 
 template <class R>
 graings::Inputs<R> inputs(const In<R>& means, const In<R>& quats, const In<R>& log_scales, const In<R>& opacities, const In<R>& colors,
-                          nb::handle offset, const In<R>& background) {
+                          const std::optional<In<R>>& offset, const In<R>& background) {
     const size_t n = opacities.size();
     return {int64_t(n), checked(means, 3 * n, "means"), checked(quats, 4 * n, "quats"), checked(log_scales, 3 * n, "log_scales"),
-            opacities.data(), checked(colors, 3 * n, "colors"), optional<const R, In<R>>(offset, 2 * n, "means2d_offset"),
+            opacities.data(), checked(colors, 3 * n, "colors"), checked(offset, 2 * n, "means2d_offset"),
             checked(background, 3, "background")};
 }
 
@@ -51,23 +53,23 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         })
         .def_prop_ro("pairs", &Frame<R>::pairs, "(tile, Gaussian) pairs")
         .def("gradient",
-             [](const Frame<R>& frame, In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, nb::object offset, In<R> background,
-                int64_t height, int64_t width, In<R> v_color, nb::object v_alpha, nb::object v_depth, Out<R> g_means, Out<R> g_quats, Out<R> g_log_scales,
-                Out<R> g_opacities, Out<R> g_colors, Out<R> g_background, nb::object g_offset, int threads) {
+             [](const Frame<R>& frame, In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, std::optional<In<R>> offset, In<R> background,
+                int64_t height, int64_t width, In<R> v_color, std::optional<In<R>> v_alpha, std::optional<In<R>> v_depth, Out<R> g_means, Out<R> g_quats, Out<R> g_log_scales,
+                Out<R> g_opacities, Out<R> g_colors, Out<R> g_background, std::optional<Out<R>> g_offset, int threads) {
                  const auto in = inputs<R>(means, quats, log_scales, opacities, colors, offset, background);
                  const size_t n = size_t(in.count), pixels = size_t(height * width);
                  const R* upstream = checked(v_color, 3 * pixels, "v_color");
-                 const R* alpha = optional<const R, In<R>>(v_alpha, pixels, "v_alpha");
-                 const R* depth = optional<const R, In<R>>(v_depth, pixels, "v_depth");
+                 const R* alpha = checked(v_alpha, pixels, "v_alpha");
+                 const R* depth = checked(v_depth, pixels, "v_depth");
                  const graings::Gradients<R> out{checked(g_means, 3 * n, "means gradient"), checked(g_quats, 4 * n, "quats gradient"),
                                                  checked(g_log_scales, 3 * n, "log_scales gradient"), checked(g_opacities, n, "opacities gradient"),
                                                  checked(g_colors, 3 * n, "colors gradient"), checked(g_background, 3, "background gradient"),
-                                                 optional<R, Out<R>>(g_offset, 2 * n, "offset gradient")};
+                                                 checked(g_offset, 2 * n, "offset gradient")};
                  nb::gil_scoped_release release;
                  frame.gradient(in, upstream, alpha, depth, out, threads);
              });
     m.def(draw_name,
-          [](In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, nb::object offset, In<R> background, In<int64_t> uids,
+          [](In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, std::optional<In<R>> offset, In<R> background, In<int64_t> uids,
              In<double> rotation, In<double> center, double fx, double fy, double cx, double cy, int64_t width, int64_t height, double alpha_min,
              double transmittance_min, double alpha_max, double blur, double near, double frustum_margin, bool compat, Out<R> color, Out<R> alpha,
              Out<R> depth, Out<R> means2d, Out<R> radii, int threads) {
@@ -84,13 +86,13 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
               return new Frame<R>(camera, settings, in, ties, out, threads);
           },
           nb::rv_policy::take_ownership);
-    m.def("ssim", [](In<R> image, In<R> target, int64_t height, int64_t width, nb::object gradient, int threads) {
+    m.def("ssim", [](In<R> image, In<R> target, int64_t height, int64_t width, std::optional<Out<R>> gradient, int threads) {
         const size_t size = size_t(3 * height * width);
         const R *first = checked(image, size, "image"), *second = checked(target, size, "target");
-        R* out = optional<R, Out<R>>(gradient, size, "gradient");
+        R* out = checked(gradient, size, "gradient");
         nb::gil_scoped_release release;
         return graings::ssim<R>(height, width, first, second, out, threads);
-    }, "image"_a, "target"_a, "height"_a, "width"_a, "gradient"_a.none(), "threads"_a);
+    });
 }
 
 }  // namespace

@@ -1,0 +1,97 @@
+"""Fused SSIM: equal to a plain convolution, the same bits on any number of threads, bounded where it is clamped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from graings.raster import kernel, ssim_reference
+from graings.raster.ssim import ssim
+from tests.raster.comparison import UNIT_ROUNDOFF, relative
+
+SIZES = [(1, 1), (1, 7), (5, 5), (17, 33), (33, 47), (40, 3)]
+
+
+@pytest.fixture(params=kernel.available_isas())
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    before = kernel.active_isa()
+    kernel.use_isa(request.param)
+    yield request.param
+    kernel.use_isa(before)
+
+
+def pair(height: int, width: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    random = torch.Generator().manual_seed(height * 1000 + width)
+    target = torch.rand(height, width, 3, generator=random, dtype=torch.float64)
+    image = (target + 0.1 * torch.randn(height, width, 3, generator=random, dtype=torch.float64)).clamp(0, 1)
+    return image.to(dtype), target.to(dtype)
+
+
+def with_gradient(function: object, image: Tensor, target: Tensor, **options: int) -> tuple[Tensor, Tensor]:
+    leaf = image.clone().requires_grad_()
+    value = function(leaf, target, **options)  # type: ignore[operator]
+    (gradient,) = torch.autograd.grad(value, leaf)
+    return value.detach(), gradient
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_double_precision_equals_a_plain_convolution(size: tuple[int, int], isa: str) -> None:
+    value, gradient = with_gradient(ssim, *pair(*size))
+    expected, expected_gradient = with_gradient(ssim_reference.ssim, *pair(*size))
+    torch.testing.assert_close(value, expected, rtol=0, atol=1e-12)
+    assert relative(gradient, expected_gradient) < 1e-12
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_single_precision_stays_close_to_double(size: tuple[int, int], isa: str) -> None:
+    image, target = pair(*size, torch.float32)
+    value, gradient = with_gradient(ssim, image, target)
+    expected, expected_gradient = with_gradient(ssim_reference.ssim, image.double(), target.double())
+    # Two passes of 11 products in [0, 1]: 24 roundings of moments <= 1, seen through the smallest divisor C2 = 9e-4.
+    bound = 24 * UNIT_ROUNDOFF / ssim_reference.C2
+    assert abs(value.double() - expected).item() <= bound
+    assert relative(gradient, expected_gradient) <= bound
+
+
+@pytest.mark.parametrize("threads", [2, 4])
+def test_any_number_of_threads_gives_the_same_bits(threads: int) -> None:
+    image, target = pair(70, 41, torch.float32)
+    one, many = (with_gradient(ssim, image, target, threads=n) for n in (1, threads))
+    assert torch.equal(one[0], many[0])
+    assert torch.equal(one[1], many[1])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("level", [0.0, 0.6, 1.0])
+def test_flat_images_stay_in_range(level: float, dtype: torch.dtype) -> None:
+    image = torch.full((20, 20, 3), level, dtype=dtype)
+    value, gradient = with_gradient(ssim, image, image + 1e-7)
+    assert -1 <= value.item() <= 1
+    assert gradient.isfinite().all()
+
+
+def test_identical_images_have_similarity_one() -> None:
+    image, _ = pair(20, 20)
+    value, gradient = with_gradient(ssim, image, image)
+    torch.testing.assert_close(value.item(), 1.0, rtol=0, atol=1e-12)
+    assert gradient.abs().max().item() < 1e-12
+
+
+def test_gradcheck_passes() -> None:
+    image, target = pair(6, 5)
+    assert torch.autograd.gradcheck(lambda x: ssim(x, target), image.clone().requires_grad_())
+
+
+def test_misuse_is_named() -> None:
+    image, target = pair(4, 4)
+    with pytest.raises(ValueError, match=r"image must have shape \(H, W, 3\)"):
+        ssim(image[..., 0], target)
+    with pytest.raises(ValueError, match="target must have the shape of image"):
+        ssim(image, target[:2])
+    with pytest.raises(ValueError, match="must both be float32 or float64"):
+        ssim(image, target.float())
+    with pytest.raises(ValueError, match="target must not require a gradient"):
+        ssim(image, target.clone().requires_grad_())
