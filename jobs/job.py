@@ -120,6 +120,6 @@ class Job:
 
 def check_id(job_id: str) -> str:
     """The id itself when it has the form of one, so that it is safe in a path. Raises `JobNotFound`."""
-    if not _ID.match(job_id):
+    if not _ID.fullmatch(job_id):
         raise JobNotFound(job_id)
     return job_id

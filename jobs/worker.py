@@ -91,10 +91,10 @@ class Worker:
         """Train a job to its end, starting over after a crash where that can help."""
         folder = self._store.folder(job_id)
         while not self._leaving:
-            hopeless = _hopeless(folder.attempts(), folder.checkpoint() or 0)
-            if hopeless is not None:
+            reason = hopeless(folder.attempts(), folder.checkpoint() or 0)
+            if reason is not None:
                 folder.close_attempts()
-                return Outcome(JobState.FAILED, hopeless)
+                return Outcome(JobState.FAILED, reason)
             attempt = folder.begin_attempt(self.id)
             LOG.info("job %s: attempt %d from iteration %d", job_id, attempt.number, attempt.checkpoint)
             trainer = Trainer(folder, self._threads)
@@ -154,7 +154,7 @@ def _outcome(ending: Ending) -> Outcome | None:
     return None
 
 
-def _hopeless(attempts: list[Attempt], checkpoint: int) -> str | None:
+def hopeless(attempts: list[Attempt], checkpoint: int) -> str | None:
     """Why another attempt would be in vain: too many of the last ones ended badly without getting any further."""
     crashes: list[Attempt] = []
     losses = 0

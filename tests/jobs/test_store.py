@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from jobs.exit_code import ExitCode
+from jobs.files import locked
+from jobs.job import JobConflict, JobNotFound, JobSpec
+from jobs.store import Store
+
+DIGEST = "ab" * 32
+
+
+def unpacked(store: Store, name: str, *files: str) -> Path:
+    folder = store.uploads / name
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_text(file)
+    return folder
+
+
+def spec(name: str = "one", capture: str = DIGEST) -> JobSpec:
+    return JobSpec(name=name, capture=capture, config={"iterations": 3}, priority=7)
+
+
+def test_a_job_comes_back_as_it_was_stored(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    job_id = store.create(spec(), unpacked(store, "u", "transforms_train.json"))
+    assert store.folder(job_id).spec() == spec()
+    assert store.ids() == [job_id]
+    assert list(store.uploads.iterdir()) == []
+
+
+def test_newer_jobs_come_first(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    ids = [store.create(spec(str(i)), unpacked(store, "u", "a.json")) for i in range(4)]
+    assert [int(one[:11], 16) for one in store.ids()] == sorted((int(one[:11], 16) for one in ids), reverse=True)
+
+
+def test_a_capture_begins_below_folders_that_hold_only_a_folder(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.create(spec(), unpacked(store, "u", "top/scene/transforms_train.json", "top/scene/train/r_0.png"))
+    assert (store.capture(DIGEST) / "transforms_train.json").is_file()
+
+
+def test_equal_captures_are_stored_once_and_go_with_their_last_job(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    first = store.create(spec(), unpacked(store, "u", "a.json"))
+    second = store.create(spec(), unpacked(store, "v", "a.json"))
+    assert not (store.uploads / "v").exists()
+    store.delete(first)
+    assert (store.capture(DIGEST) / "a.json").exists()
+    store.delete(second)
+    assert list((tmp_path / "captures").iterdir()) == []
+    with pytest.raises(JobNotFound):
+        store.folder(second)
+
+
+def test_a_job_whose_trainer_still_writes_is_not_deleted(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    job_id = store.create(spec(), unpacked(store, "u", "a.json"))
+    with locked(store.folder(job_id).lock), pytest.raises(JobConflict, match="few seconds"):
+        store.delete(job_id)
+    store.delete(job_id)
+
+
+def test_attempts_are_counted_before_they_can_fail(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    folder = store.folder(store.create(spec(), unpacked(store, "u", "a.json")))
+    first = folder.begin_attempt("worker-a")
+    assert [(one.number, one.exit_code) for one in folder.attempts()] == [(1, None)]
+    folder.end_attempt(first, ExitCode.CRASHED, "boom")
+    second = folder.begin_attempt("worker-b")
+    assert [(one.number, one.exit_code, one.message) for one in folder.attempts()] == [(1, 1, "boom"), (2, None, None)]
+    assert second.checkpoint == 0

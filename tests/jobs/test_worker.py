@@ -1,0 +1,156 @@
+"""Real workers, real trainers, real signals, on a capture of a few small images."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from graings.capture.synthetic import write_synthetic
+from graings.config import make_config
+from jobs.commands import default_database
+from jobs.engine import Engine
+from jobs.exit_code import ExitCode
+from jobs.files import locked
+from jobs.job import Attempt, JobConflict, JobSpec, JobState
+from jobs.queue import JobQueue
+from jobs.store import Store
+from jobs.worker import MAX_CRASHES, MAX_LOSSES, hopeless
+
+LONG_S = 120.0
+# Long enough to be interrupted; what is interrupted starts over from a checkpoint at most 20 iterations back.
+ENDLESS = {"iterations": 100_000, "init.points": 300, "evaluation.checkpoint_every": 20, "evaluation.first": 99_000}
+BRIEF = {"iterations": 30, "init.points": 300, "evaluation.views": 1}
+
+
+@pytest.fixture
+def jobs(tmp_path: Path) -> Iterator[JobQueue]:
+    store = Store(tmp_path / "data")
+    engine = Engine(default_database(store.root))
+    yield JobQueue(store, engine)
+    engine.close()
+
+
+def submit(jobs: JobQueue, options: dict[str, object], name: str = "job") -> str:
+    unpacked = write_synthetic(jobs.store.uploads / name, frames=6, size=24)
+    config = make_config("draft", options).model_dump(mode="json")
+    return jobs.submit(JobSpec(name=name, capture=f"{name:0<64}", config=config), unpacked).id
+
+
+@contextmanager
+def working(jobs: JobQueue) -> Iterator[subprocess.Popen[bytes]]:
+    """A worker process; interrupted at the end unless it has ended by then."""
+    command = [sys.executable, "-m", "jobs.commands", "--data", str(jobs.store.root), "--threads", "1"]
+    with subprocess.Popen(command) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + LONG_S
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.1)
+
+
+def resting(jobs: JobQueue, job_id: str) -> bool:
+    """Whether no trainer is in the job's folder."""
+    with locked(jobs.store.folder(job_id).lock, wait=False) as free:
+        return free
+
+
+def test_a_job_outlives_kill_9_of_its_worker_and_leaving_brings_it_back_in_the_queue(jobs: JobQueue) -> None:
+    job_id = submit(jobs, ENDLESS)
+    folder = jobs.store.folder(job_id)
+    with working(jobs) as first:
+        until(lambda: folder.checkpoint())
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+        reached = folder.checkpoint() or 0
+        assert jobs.get(job_id).state is JobState.RUNNING  # nobody knows better yet
+    with working(jobs) as second:
+        until(lambda: jobs.get(job_id).attempts == 2)
+        lost, taken_over = folder.attempts()
+        assert lost.exit_code is None
+        assert lost.worker != taken_over.worker
+        assert taken_over.checkpoint >= reached > 0
+        # The orphan noticed its parent's death and stopped at a checkpoint; the new trainer goes on beyond it.
+        until(lambda: (folder.checkpoint() or 0) > taken_over.checkpoint)
+        second.terminate()
+        assert second.wait(LONG_S) == 0
+    job = jobs.get(job_id)
+    assert (job.state, resting(jobs, job_id)) == (JobState.QUEUED, True)
+    assert folder.attempts()[-1].exit_code == ExitCode.STOPPED
+    assert job.progress is not None
+    assert job.checkpoint is not None
+    assert job.checkpoint >= job.progress["iteration"]
+    assert list(jobs.store.workers.iterdir()) == []
+
+
+def test_jobs_are_cancelled_resumed_retried_and_finished(jobs: JobQueue) -> None:
+    endless, brief = submit(jobs, ENDLESS, "a"), submit(jobs, BRIEF, "b")
+    broken = submit(jobs, BRIEF, "c")
+    (jobs.store.capture(f"{'c':0<64}") / "transforms_train.json").write_text("{}")
+    with working(jobs):
+        until(lambda: jobs.store.folder(endless).checkpoint())
+        with pytest.raises(JobConflict, match="Cancel it first"):
+            jobs.delete(endless)
+        assert jobs.cancel(endless).state is JobState.CANCELLED
+        assert jobs.cancel(endless).state is JobState.CANCELLED
+        with pytest.raises(JobConflict, match="Use resume"):
+            jobs.retry(endless)
+        until(lambda: jobs.get(brief).state.final and jobs.get(broken).state.final)
+        assert resting(jobs, endless)
+
+        done = jobs.get(brief)
+        assert (done.state, done.error, done.checkpoint) == (JobState.SUCCEEDED, None, 30)
+        assert done.has_metrics
+        for refused in (jobs.cancel, jobs.resume, jobs.retry):
+            with pytest.raises(JobConflict):
+                refused(brief)
+
+        failed = jobs.get(broken)
+        assert failed.state is JobState.FAILED
+        assert failed.attempts == 1  # trying again would not help
+        assert "transforms_train.json" in (failed.error or "")
+        with pytest.raises(JobConflict, match="Use retry"):
+            jobs.resume(broken)
+        jobs.retry(broken)
+        until(lambda: jobs.get(broken).attempts == 2 and jobs.get(broken).state.final)
+
+        reached = jobs.get(endless).checkpoint or 0
+        jobs.resume(endless)
+        until(lambda: (jobs.get(endless).checkpoint or 0) > reached)
+        # Cancelled and resumed before the worker can notice: still only one trainer, and it goes on.
+        jobs.cancel(endless)
+        jobs.resume(endless)
+        until(lambda: jobs.get(endless).attempts == 3)
+        assert jobs.store.folder(endless).attempts()[-1].checkpoint > reached
+        jobs.cancel(endless)
+    jobs.delete(endless)
+    assert [job.id for job in jobs.page(10)[0]] == [broken, brief]
+
+
+def attempts(*exit_codes: int | None, checkpoint: int = 0, final: bool = False) -> list[Attempt]:
+    return [Attempt(i, "w", 0.0, checkpoint, None, code, None, final) for i, code in enumerate(exit_codes, start=1)]
+
+
+def test_a_job_is_given_up_when_attempts_in_a_row_end_badly_at_the_same_checkpoint() -> None:
+    assert hopeless(attempts(*[1] * (MAX_CRASHES - 1)), 0) is None
+    assert "exit code 1" in (hopeless(attempts(*[1] * MAX_CRASHES), 0) or "")
+    assert "memory" in (hopeless(attempts(*[-9] * MAX_CRASHES), 0) or "")
+    assert "worker died" in (hopeless(attempts(*[None] * MAX_LOSSES), 0) or "")
+
+
+def test_progress_a_stop_on_request_and_a_retry_start_the_count_anew() -> None:
+    assert hopeless(attempts(*[1] * 9, checkpoint=100), 200) is None
+    assert hopeless(attempts(*[ExitCode.STOPPED] * 99), 0) is None
+    assert hopeless(attempts(*[1] * 9, final=True), 0) is None
