@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -256,11 +255,3 @@ def test_a_verb_that_cannot_be_loaded_says_so_when_it_is_used_and_not_before(
     capsys.readouterr()
     assert graings("float", "--high", "up") == 69
     assert "package_that_is_not_there" in capsys.readouterr().err
-
-
-def test_the_package_runs_as_a_module() -> None:
-    environment = os.environ | {"COLUMNS": "100"}
-    command = [sys.executable, "-m", "graings", "--help"]
-    answer = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert answer.returncode == 0
-    assert "Usage: graings" in answer.stdout
