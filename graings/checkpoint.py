@@ -26,17 +26,17 @@ from torch import Tensor
 from graings.camera import Camera, View
 from graings.config import SceneConfig, TrainConfig
 from graings.errors import CheckpointError
+from graings.run_folder import CHECKPOINTS, FACTS_FILE, checkpoints
+from graings.run_folder import newest_checkpoint as newest_checkpoint  # part of this module's interface too
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.units import Units
 
 FORMAT = "graings.checkpoint/1"
-FOLDER = "checkpoints"
 KEEP = 2
 
 _SCENE_FILE = "scene.safetensors"
 _STATE_FILE = "state.safetensors"
-_FACTS_FILE = "checkpoint.json"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ def save_checkpoint(
     finished: bool,
 ) -> Path:
     """Write a checkpoint and drop all but the last two. Returns its folder; `CheckpointError` on a full disk."""
-    folder = run / FOLDER
+    folder = run / CHECKPOINTS
     final = folder / f"{iteration:08d}"
     part = folder / f".{iteration:08d}.part"
     try:
@@ -103,7 +103,7 @@ def save_checkpoint(
             "views": {split: [_view_to_json(view) for view in members] for split, members in views.items()},
             "state": state.facts,
         }
-        (part / _FACTS_FILE).write_text(json.dumps(facts, allow_nan=False))
+        (part / FACTS_FILE).write_text(json.dumps(facts, allow_nan=False))
         for file in part.iterdir():
             _flush(file)
         _flush(part)
@@ -120,15 +120,9 @@ def save_checkpoint(
         raise CheckpointError(
             f"{final}: cannot write the checkpoint ({error}). Free some space; earlier ones are kept."
         ) from error
-    for outdated in _checkpoints(run)[:-KEEP]:
+    for outdated in checkpoints(run)[:-KEEP]:
         shutil.rmtree(outdated, ignore_errors=True)
     return final
-
-
-def newest_checkpoint(run: Path) -> Path | None:
-    """The newest whole checkpoint of a run folder, or None."""
-    found = _checkpoints(run)
-    return found[-1] if found else None
 
 
 def load_model(path: Path) -> Model:
@@ -169,15 +163,8 @@ def load_state(path: Path) -> TrainingState:
         ) from error
 
 
-def _checkpoints(run: Path) -> list[Path]:
-    folder = run / FOLDER
-    if not folder.is_dir():
-        return []
-    return sorted(p for p in folder.iterdir() if p.name.isdigit() and (p / _FACTS_FILE).is_file())
-
-
 def _resolve(path: Path) -> Path:
-    if (path / _FACTS_FILE).is_file():
+    if (path / FACTS_FILE).is_file():
         return path
     newest = newest_checkpoint(path)
     if newest is None:
@@ -187,11 +174,11 @@ def _resolve(path: Path) -> Path:
 
 def _read_facts(folder: Path) -> dict[str, Any]:
     try:
-        facts = json.loads((folder / _FACTS_FILE).read_text())
+        facts = json.loads((folder / FACTS_FILE).read_text())
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"{folder / _FACTS_FILE}: not readable ({error}). Use an earlier checkpoint.") from error
+        raise CheckpointError(f"{folder / FACTS_FILE}: not readable ({error}). Use an earlier checkpoint.") from error
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise CheckpointError(f"{folder / _FACTS_FILE}: not in the format {FORMAT}. It was written by another version.")
+        raise CheckpointError(f"{folder / FACTS_FILE}: not in the format {FORMAT}. It was written by another version.")
     return facts
 
 

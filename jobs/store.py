@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from graings.checkpoint import newest_checkpoint
+from graings.run_folder import newest_checkpoint
 from jobs.files import locked, write_json
 from jobs.job import Attempt, JobConflict, JobError, JobNotFound, JobSpec, check_id
 

@@ -35,7 +35,10 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.metrics": (),
     "graings.report": ("graings.errors",),
     "graings.plan": ("graings.capture.capture", "graings.config"),
-    "graings.checkpoint": ("graings.camera", "graings.config", "graings.errors", "graings.scene", "graings.units"),
+    "graings.run_folder": (),
+    "graings.checkpoint": (
+        *("graings.camera", "graings.config", "graings.errors", "graings.run_folder", "graings.scene", "graings.units"),
+    ),
     "graings.evaluation": (
         *("graings.capture", "graings.checkpoint", "graings.errors", "graings.metrics", "graings.render"),
         *("graings.report", "graings.scene"),
@@ -56,7 +59,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     "graings.__main__": ("graings.cli",),
     # Durable work knows the method by its options and its files; one child process knows how to train.
-    "jobs": ("jobs", "graings.config", "graings.errors", "graings.checkpoint", "graings.report"),
+    "jobs": ("jobs", "graings.config", "graings.errors", "graings.run_folder"),
     "jobs.trainer_process": ("jobs", "graings.errors", "graings.config", "graings.training.run"),
     # HTTP never trains.
     "service": (

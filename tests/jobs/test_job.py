@@ -5,7 +5,9 @@ import pytest
 from jobs.job import JobNotFound, JobState, check_id
 
 
-@pytest.mark.parametrize("job_id", ["", "../../etc/passwd", "019a2b3c4d5e8f0", "019A2B3C4D5E8F01", "019a2b3c4d5e8f01\n"])
+@pytest.mark.parametrize(
+    "job_id", ["", "../../etc/passwd", "019a2b3c4d5e8f0", "019A2B3C4D5E8F01", "019a2b3c4d5e8f01\n"]
+)
 def test_what_is_no_id_is_no_job(job_id: str) -> None:
     with pytest.raises(JobNotFound):
         check_id(job_id)

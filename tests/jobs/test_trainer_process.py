@@ -9,7 +9,6 @@ from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
-from jobs.progress import read_progress
 from jobs.store import JobFolder, Store
 
 
@@ -22,18 +21,6 @@ def job(store: Store) -> JobFolder:
 def trainer(folder: JobFolder) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "jobs.trainer_process", str(folder.path), "--threads", "1"]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-
-
-def test_the_end_of_its_parent_stops_the_trainer_at_a_checkpoint(tmp_path: Path) -> None:
-    folder = job(Store(tmp_path))
-    with trainer(folder) as process:
-        assert process.stdin is not None
-        while len(read_progress(folder.progress, 0)[0]) < 2:  # loading, and a first step
-            assert process.poll() is None
-        process.stdin.close()
-        assert process.wait(60) == ExitCode.STOPPED
-    last = read_progress(folder.progress, 0)[0][-1][1]
-    assert (folder.checkpoint() or 0) >= last["iteration"] > 0
 
 
 def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_path: Path) -> None:
