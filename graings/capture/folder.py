@@ -29,9 +29,13 @@ class CaptureFolder:
         try:
             path = self.root / name
             outside = Path(name).is_absolute() or not path.resolve().is_relative_to(self.root)
+            path.is_file()  # raises for what no file can be called, and for what may not be looked at
         except (OSError, ValueError, RuntimeError) as error:  # a NUL byte, a name too long, a loop of links
             raise CaptureError(
-                f"cannot use the path {name[:200]!r} ({error})", file=source, field=field, remedy="Give a plain path."
+                f"cannot use the path {name[:80]!r} ({getattr(error, 'strerror', None) or error})",
+                file=source,
+                field=field,
+                remedy="Give a plain path inside the capture.",
             ) from error
         if outside:
             raise CaptureError(

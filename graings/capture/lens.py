@@ -51,8 +51,9 @@ class Lens:
         fx, fy, cx, cy = (float(value) for value in flat.params)
         lens = Lens(model, params, size, (fx, fy, cx, cy), (flat.width, flat.height))
         # pycolmap answers for any numbers: what it promises, no blank borders, is what absurd ones break.
-        share = np.arange(33) / 32
-        probe = lens._photograph(0.5 + share * (flat.width - 1), 0.5 + share * (flat.height - 1))
+        u = np.linspace(0.5, flat.width - 0.5, 33)
+        v = np.linspace(0.5, flat.height - 0.5, 33)
+        probe = lens._photograph(u, v)
         if not ((probe > -1.0) & (probe < np.array(size) + 1.0)).all():  # False for NaN as well
             raise ValueError("its undistorted picture reaches outside the photograph")
         return lens
@@ -62,7 +63,7 @@ class Lens:
         width, height = self.pinhole_size
         return self._photograph(np.arange(width) + 0.5, np.arange(height) + 0.5)
 
-    def _photograph(self, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _photograph(self, u: NDArray[np.floating], v: NDArray[np.floating]) -> NDArray[np.float64]:
         fx, fy, cx, cy = self.pinhole
         x, y = np.meshgrid((u - cx) / fx, (v - cy) / fy)
         rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)

@@ -25,9 +25,12 @@ CAMERA_DISTANCE: Final = 4.0
 FIELD_OF_VIEW: Final = 0.69  # horizontal, radians; both as in the D-NeRF scenes
 SAMPLES: Final = 4  # per pixel and axis
 
-# Bodies hang on a ring around the origin and swing about their places without touching.
+# Bodies hang on a ring around the origin and swing about their places; the more there are, the smaller, so that they
+# cannot touch.
 RING: Final = 0.75
-SWING: Final = (0.12, 0.12, 0.3)
+SIDE_SWING: Final = 0.12
+LIFT: Final = 0.3
+LARGEST: Final = 0.42
 SQUASH: Final = 0.2  # relative change of the first semi-axis; the others take half of it, the other way
 TURN: Final = 1.5  # radians from t = 0 to 1
 TINT: Final = 0.06  # amplitude of the change of colour
@@ -44,6 +47,7 @@ class Body:
     """An ellipsoid with a two-coloured pattern."""
 
     home: Array  # [3] centre of its swing
+    swing: Array  # [3] amplitudes along x, y, z
     semi_axes: Array  # [3] at rest
     axis: Array  # [3] unit axis it turns about
     colors: Array  # [2, 3] the two ends of the pattern
@@ -51,7 +55,7 @@ class Body:
 
     def center(self, time: float) -> Array:
         """Centre [3] at `time` in [0, 1]."""
-        return self.home + np.array(SWING) * np.sin(2 * np.pi * time + self.phases[:3])
+        return self.home + self.swing * np.sin(2 * np.pi * time + self.phases[:3])
 
     def rotation(self, time: float) -> Array:
         """Body axes as columns, [3, 3]."""
@@ -90,6 +94,8 @@ class SyntheticScene:
             raise ValueError(f"bodies must be at least 1, got {bodies}")
         rng = np.random.default_rng(seed)
         spacing = 2 * RING * math.sin(math.pi / bodies) if bodies > 1 else 2 * RING
+        side = min(SIDE_SWING, 0.09 * spacing)
+        largest = min(LARGEST, (spacing - 2 * math.sqrt(2) * side) / (2 * (1 + SQUASH)))
         made = []
         for index in range(bodies):
             angle = 2 * math.pi * index / bodies + 0.3
@@ -99,7 +105,8 @@ class SyntheticScene:
             made.append(
                 Body(
                     home=np.array([reach * math.cos(angle), reach * math.sin(angle), rng.uniform(-0.15, 0.15)]),
-                    semi_axes=min(0.42, 0.3 * spacing) * rng.uniform(0.75, 1.0, size=3),
+                    swing=np.array([side, side, LIFT]),
+                    semi_axes=largest * rng.uniform(0.75, 1.0, size=3),
                     axis=axis / np.linalg.norm(axis),
                     colors=np.stack([_hue(hue, 0.95), _hue(hue + 0.1, 0.5)]),
                     phases=rng.uniform(0, 2 * np.pi, size=6),

@@ -1,0 +1,100 @@
+"""Tiny captures written to disk by the tests, and ways to break them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pycolmap
+from numpy.typing import NDArray
+
+from graings.camera import Camera
+
+FOV = 0.7
+
+
+def pixels(height: int, width: int, channels: int = 4, seed: int = 0) -> NDArray[np.uint8]:
+    """Random 8-bit pixels [H, W, C]."""
+    return np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
+
+
+def write_image(path: Path, image: NDArray[Any], stored: str | None = None) -> Path:
+    """Write `image` [H, W, C] as it is, alpha straight; `stored` is OpenImageIO's pixel type."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    spec = oiio.ImageSpec(image.shape[1], image.shape[0], image.shape[2], stored or str(image.dtype))
+    spec["oiio:UnassociatedAlpha"] = 1
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec), output.geterror()
+    assert output.write_image(np.ascontiguousarray(image)), output.geterror()
+    assert output.close()
+    return path
+
+
+def orbit(index: int, count: int, size: tuple[int, int] = (12, 12), radius: float = 4.0) -> Camera:
+    """One of `count` cameras on a ring, looking at the origin."""
+    return Camera.orbit(360.0 * index / count, 20.0, radius, fov=FOV, width=size[0], height=size[1])
+
+
+def opengl(camera: Camera) -> list[list[float]]:
+    """The camera's pose as `transform_matrix`: camera to world, y up, z back."""
+    pose = np.linalg.inv(camera.world_to_camera)
+    pose[:3, 1:3] *= -1.0
+    return pose.tolist()  # type: ignore[no-any-return]
+
+
+def entry(camera: Camera, name: str, time: float | None = None, **keys: Any) -> dict[str, Any]:
+    """One frame of a transforms file."""
+    frame = {"file_path": name, "transform_matrix": opengl(camera), **keys}
+    return frame if time is None else {**frame, "time": time}
+
+
+def write_transforms(folder: Path, split: str, frames: list[dict[str, Any]], **keys: Any) -> Path:
+    """Write one transforms file; returns its path."""
+    path = folder / f"transforms_{split}.json"
+    path.write_text(json.dumps({"camera_angle_x": FOV, **keys, "frames": frames}))
+    return path
+
+
+def write_dnerf(folder: Path, times: list[float] | None = None, *, radius: float = 4.0) -> Path:
+    """A sound capture of four training images (one for each time where given) of 12x12 px."""
+    count = 4 if times is None else len(times)
+    for index in range(count):
+        write_image(folder / f"train/r_{index:03d}.png", pixels(12, 12, seed=index))
+    frames = [
+        entry(orbit(i, count, radius=radius), f"./train/r_{i:03d}", None if times is None else times[i])
+        for i in range(count)
+    ]
+    write_transforms(folder, "train", frames)
+    return folder
+
+
+def write_colmap(
+    folder: Path,
+    *,
+    count: int = 10,
+    model: str = "PINHOLE",
+    params: tuple[float, ...] = (30.0, 31.0, 15.5, 10.5),
+    size: tuple[int, int] = (32, 20),
+    text: bool = False,
+    where: str = "sparse/0",
+    points: int = 40,
+) -> Path:
+    """A COLMAP folder written by pycolmap: cameras on a ring, points in a ball, images of noise."""
+    (folder / where).mkdir(parents=True, exist_ok=True)
+    scene = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params), camera_id=1)
+    scene.add_camera_with_trivial_rig(camera)
+    for index in range(count):
+        name = f"frame_{10 * index:04d}.png"
+        write_image(folder / "images" / name, pixels(size[1], size[0], 3, seed=index))
+        pose = orbit(index, count).world_to_camera
+        image = pycolmap.Image(name=name, camera_id=1, image_id=index + 1)
+        scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    rng = np.random.default_rng(0)
+    for position in rng.normal(size=(points, 3)) * 0.3:
+        scene.add_point3D(position, pycolmap.Track(), np.array([255, 51, 0], dtype=np.uint8))
+    (scene.write_text if text else scene.write_binary)(str(folder / where))
+    return folder

@@ -1,0 +1,356 @@
+"""Captures that cannot be used: each is refused with file, field and what is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graings.capture.load import load_capture
+from graings.config import CaptureConfig
+from graings.errors import CaptureError
+from tests.capture.captures import entry, orbit, pixels, write_colmap, write_dnerf, write_image, write_transforms
+
+TIMES = [0.0, 0.25, 0.5, 1.0]
+Break = Callable[[Path], Any]
+TRAIN = "transforms_train.json"
+
+
+def edit(change: Callable[[dict[str, Any]], Any]) -> Break:
+    """Change the parsed transforms_train.json."""
+
+    def apply(folder: Path) -> None:
+        path = folder / TRAIN
+        document = json.loads(path.read_text())
+        change(document)
+        path.write_text(json.dumps(document))
+
+    return apply
+
+
+def frame(**keys: Any) -> Break:
+    """Set keys of the third frame."""
+    return edit(lambda document: document["frames"][2].update(keys))
+
+
+def matrix(change: Callable[[np.ndarray], Any]) -> Break:
+    """Change the pose of the third frame in place."""
+
+    def apply(document: dict[str, Any]) -> None:
+        pose = np.array(document["frames"][2]["transform_matrix"])
+        change(pose)
+        document["frames"][2]["transform_matrix"] = pose.tolist()
+
+    return edit(apply)
+
+
+def cut(name: str, keep: Callable[[bytes], bytes]) -> Break:
+    """Rewrite a file's bytes."""
+    return lambda folder: (folder / name).write_bytes(keep((folder / name).read_bytes()))
+
+
+def as_jpeg(keep: float) -> Break:
+    """Replace the third image by a JPEG of which a share is left."""
+
+    def apply(folder: Path) -> None:
+        path = write_image(folder / "train/r_002.jpg", pixels(64, 64, 3))
+        (folder / "train/r_002.png").unlink()
+        data = path.read_bytes()
+        path.write_bytes(data[: int(len(data) * keep)])
+
+    return apply
+
+
+def as_exr(folder: Path) -> None:
+    path = write_image(folder / "train/r_002.exr", pixels(64, 64, 3).astype(np.float32), "half")
+    (folder / "train/r_002.png").unlink()
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def flip_a_byte(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 0xFF]) + data[middle + 1 :]
+
+
+def link_outside(folder: Path) -> None:
+    secret = write_image(folder.parent / "outside.png", pixels(12, 12))
+    (folder / "train/r_002.png").unlink()
+    os.symlink(secret, folder / "train/r_002.png")
+
+
+def shear(pose: np.ndarray) -> None:
+    pose[:3, 0] += 0.2 * pose[:3, 1]
+
+
+def scale(pose: np.ndarray) -> None:
+    pose[:3, :3] *= 1.5
+
+
+def mirror(pose: np.ndarray) -> None:
+    pose[:3, 0] *= -1
+
+
+def flatten(pose: np.ndarray) -> None:
+    pose[:3, 2] = 0
+
+
+def wreck_last_row(pose: np.ndarray) -> None:
+    pose[3] = (0, 0, 1, 1)
+
+
+BROKEN: dict[str, tuple[Break, str]] = {
+    "missing image": (lambda f: (f / "train/r_002.png").unlink(), rf"{TRAIN}, frames\[2\]\.file_path: .*is missing"),
+    "truncated PNG": (cut("train/r_002.png", lambda d: d[: len(d) // 2]), r"train/r_002\.png: is truncated or damaged"),
+    "PNG without end": (cut("train/r_002.png", lambda d: d[:-12]), r"train/r_002\.png: is truncated"),
+    "damaged PNG": (cut("train/r_002.png", flip_a_byte), r"train/r_002\.png: is truncated or damaged"),
+    "empty image": (cut("train/r_002.png", lambda d: b""), r"train/r_002\.png: is truncated"),
+    "truncated JPEG": (as_jpeg(0.7), r"train/r_002\.jpg: is truncated"),
+    "JPEG header only": (as_jpeg(0.01), r"train/r_002\.jpg: is truncated"),
+    "truncated EXR": (as_exr, r"train/r_002\.exr: cannot be (decoded|opened)"),
+    "text as image": (cut("train/r_002.png", lambda d: b"hello"), r"train/r_002\.png: is no PNG, JPEG or OpenEXR"),
+    "broken JSON": (cut(TRAIN, lambda d: d[:200]), rf"{TRAIN}: invalid JSON"),
+    "JSON that is a list": (cut(TRAIN, lambda d: b"[]"), rf"{TRAIN}: input should be an object"),
+    "JSON with bad text": (cut(TRAIN, lambda d: b"\xff\xfe{}"), rf"{TRAIN}: "),
+    "deeply nested JSON": (cut(TRAIN, lambda d: b"[" * 100_000), rf"{TRAIN}: "),
+    "no frames key": (edit(lambda d: d.pop("frames")), rf"{TRAIN}, frames: the key is missing"),
+    "zero frames": (edit(lambda d: d.update(frames=[])), rf"{TRAIN}, frames: has no frames"),
+    "no pose": (
+        edit(lambda d: d["frames"][2].pop("transform_matrix")),
+        rf"{TRAIN}, frames\[2\]\.transform_matrix: the key is missing",
+    ),
+    "no focal length": (edit(lambda d: d.pop("camera_angle_x")), rf"{TRAIN}, frames\[0\]: no focal length"),
+    "file_path is a number": (frame(file_path=3), rf"{TRAIN}, frames\[2\]\.file_path: .*valid string"),
+    "time is text": (frame(time="NaN"), rf"{TRAIN}, frames\[2\]\.time: .*valid number"),
+    "time is not finite": (frame(time=math.nan), rf"{TRAIN}, frames\[2\]\.time: .*finite number"),
+    "time is infinite": (frame(time=-math.inf), rf"{TRAIN}, frames\[2\]\.time: .*finite number"),
+    "time is absurd": (frame(time=1e300), r"train/r_002\.png, time: is 1e\+300"),
+    "time is true": (frame(time=True), rf"{TRAIN}, frames\[2\]\.time: .*valid number"),
+    "time for some only": (
+        edit(lambda d: d["frames"][2].pop("time")),
+        rf"{TRAIN}, frames\[2\]\.time: the time is missing here but given for other frames",
+    ),
+    "pose is not finite": (
+        matrix(lambda m: m.__setitem__((0, 3), math.nan)),
+        rf"{TRAIN}, frames\[2\]\.transform_matrix\[0\]\[3\]: .*finite number",
+    ),
+    "pose is absurd": (
+        matrix(lambda m: m.__setitem__((0, 3), 1e200)),
+        r"train/r_002\.png, camera position: is 1e\+200",
+    ),
+    "pose of three rows": (
+        frame(transform_matrix=np.eye(4)[:3].tolist()),
+        rf"{TRAIN}, frames\[2\]\.transform_matrix: .*at least 4 items",
+    ),
+    "pose scales": (matrix(scale), rf"{TRAIN}, frames\[2\]\.transform_matrix: the rotation part scales by 1\.5"),
+    "pose mirrors": (matrix(mirror), rf"{TRAIN}, frames\[2\]\.transform_matrix: the rotation part mirrors"),
+    "pose shears": (matrix(shear), rf"{TRAIN}, frames\[2\]\.transform_matrix: the rotation part shears"),
+    "pose is singular": (matrix(flatten), rf"{TRAIN}, frames\[2\]\.transform_matrix: the rotation part is singular"),
+    "pose with a wrong last row": (matrix(wreck_last_row), rf"{TRAIN}, frames\[2\]\.transform_matrix: the last row"),
+    "negative focal length": (frame(fl_x=-20.0), rf"{TRAIN}, frames\[2\]\.fl_x: .*greater than 0"),
+    "zero angle": (edit(lambda d: d.update(camera_angle_x=0.0)), rf"{TRAIN}, camera_angle_x: .*greater than 0"),
+    "angle of a half turn": (frame(camera_angle_x=math.pi), rf"{TRAIN}, frames\[2\]\.camera_angle_x: .*less than"),
+    "width of zero": (frame(w=0), rf"{TRAIN}, frames\[2\]\.w: .*greater than 0"),
+    "intrinsics for another shape": (frame(w=12, h=24), rf"{TRAIN}, frames\[2\]\.w, h: .*12x24 px.*has 12x12"),
+    "distorted lens": (frame(k1=0.1), rf"{TRAIN}, k1: lens distortion"),
+    "frame listed twice": (
+        frame(file_path="train/../train/r_001.png"),
+        rf"{TRAIN}, frames\[2\]\.file_path: the image train/r_001\.png is listed twice, first in frames\[1\]",
+    ),
+    "path above the capture": (frame(file_path="../outside"), rf"{TRAIN}, frames\[2\]\.file_path: .*leads outside"),
+    "absolute path": (frame(file_path="/etc/hostname"), rf"{TRAIN}, frames\[2\]\.file_path: .*leads outside"),
+    "link to the outside": (link_outside, rf"{TRAIN}, frames\[2\]\.file_path: .*leads outside"),
+    "path with a NUL": (frame(file_path="a\0b"), rf"{TRAIN}, frames\[2\]\.file_path: cannot use the path"),
+    "path without end": (frame(file_path="a" * 10_000), rf"{TRAIN}, frames\[2\]\.file_path: cannot use the path"),
+    "train file missing": (
+        lambda f: (f / TRAIN).rename(f / "transforms_test.json"),
+        rf"{TRAIN}: is missing",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_capture_is_refused_with_its_reason(tmp_path: Path, name: str) -> None:
+    (tmp_path / "scene").mkdir()
+    folder = write_dnerf(tmp_path / "scene", TIMES)
+    load_capture(folder)  # sound before it is broken
+    breaks, message = BROKEN[name]
+    breaks(folder)
+    with pytest.raises(CaptureError, match=f"^{message}") as caught:
+        load_capture(folder)
+    assert caught.value.remedy
+    assert str(tmp_path) not in str(caught.value)
+
+
+def test_broken_held_out_split_is_refused_too(tmp_path: Path) -> None:
+    write_dnerf(tmp_path, TIMES)
+    write_transforms(tmp_path, "test", [entry(orbit(0, 4), "./test/r_000", 0.5)])
+    with pytest.raises(CaptureError, match=r"^transforms_test\.json, frames\[0\]\.file_path: .*is missing"):
+        load_capture(tmp_path)
+
+
+def patch(name: str, at: int, layout: str, *values: float) -> Break:
+    """Overwrite numbers in a binary model file."""
+
+    def apply(data: bytes) -> bytes:
+        changed = bytearray(data)
+        struct.pack_into(layout, changed, at, *values)
+        return bytes(changed)
+
+    return cut(name, apply)
+
+
+CAMERAS, IMAGES, POINTS = (f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D"))
+# cameras.bin: count, then id, model, width, height, fx, fy, cx, cy. images.bin: count, then id, quaternion, ...
+BROKEN_COLMAP: dict[str, tuple[Break, str]] = {
+    "missing photograph": (
+        lambda f: (f / "images/frame_0030.png").unlink(),
+        r"sparse/0, image 'frame_0030\.png': .*is missing",
+    ),
+    "missing images.bin": (lambda f: (f / IMAGES).unlink(), rf"{IMAGES}: is missing"),
+    "missing points": (lambda f: (f / POINTS).unlink(), rf"{POINTS}: is missing"),
+    "truncated cameras.bin": (cut(CAMERAS, lambda d: d[:-1]), rf"{CAMERAS}: is truncated"),
+    "truncated images.bin": (cut(IMAGES, lambda d: d[: len(d) // 2]), rf"{IMAGES}: is truncated"),
+    "images.bin cut in a name": (cut(IMAGES, lambda d: d[: 8 + 64 + 5]), rf"{IMAGES}: is truncated"),
+    "truncated points3D.bin": (cut(POINTS, lambda d: d[:-5]), rf"{POINTS}: is truncated"),
+    "empty cameras.bin": (cut(CAMERAS, lambda d: b""), rf"{CAMERAS}: is truncated"),
+    "bytes too many": (cut(CAMERAS, lambda d: d + b"\0\0"), rf"{CAMERAS}: 2 bytes too many"),
+    "absurd count": (patch(POINTS, 0, "<Q", 2**63), rf"{POINTS}: is truncated"),
+    "no images": (cut(IMAGES, lambda d: struct.pack("<Q", 0)), r"sparse/0, images: the model has no registered image"),
+    "unknown camera model": (patch(CAMERAS, 12, "<i", 77), rf"{CAMERAS}: camera 1 has the unknown model 77"),
+    "negative focal length": (patch(CAMERAS, 32, "<d", -30.0), rf"{CAMERAS}: camera 1 needs .*positive focal"),
+    "focal length is not finite": (patch(CAMERAS, 32, "<d", math.nan), rf"{CAMERAS}: camera 1 needs finite"),
+    "camera without a size": (patch(CAMERAS, 16, "<Q", 0), rf"{CAMERAS}: camera 1 has the size 0x20"),
+    "camera of another shape": (patch(CAMERAS, 16, "<Q", 50), r"sparse/0, cameras: the camera is for 50x20 px"),
+    "missing camera": (patch(CAMERAS, 8, "<I", 5), r"sparse/0, cameras: the image .* refers to camera 1"),
+    "zero rotation": (patch(IMAGES, 12, "<4d", 0, 0, 0, 0), rf"{IMAGES}, frame_0000\.png: the rotation is zero"),
+    "pose is not finite": (patch(IMAGES, 44, "<d", math.inf), rf"{IMAGES}, frame_0000\.png: the pose is not finite"),
+    "name leads outside": (
+        cut(IMAGES, lambda d: d.replace(b"frame_0030.png", b"../../0030.png")),
+        r"sparse/0, image '\.\./\.\./0030\.png': .*leads outside",
+    ),
+    "image listed twice": (
+        cut(IMAGES, lambda d: d.replace(b"frame_0030.png", b"frame_0040.png")),
+        r"sparse/0, images: the image frame_0040\.png is listed twice",
+    ),
+    "times without one image": (
+        lambda f: (f / "times.json").write_text('{"frame_0000.png": 1}'),
+        r"times\.json, frame_0010\.png: the time is missing",
+    ),
+    "times that are text": (
+        lambda f: (f / "times.json").write_text('{"frame_0000.png": "NaN"}'),
+        r"times\.json, frame_0000\.png: input should be a valid number",
+    ),
+    "unknown test image": (
+        lambda f: (f / "sparse/0/test.txt").write_text("nobody.png\n"),
+        r"sparse/0/test\.txt: 'nobody\.png' is no image of the model",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_COLMAP)
+def test_broken_colmap_folder_is_refused_with_its_reason(tmp_path: Path, name: str) -> None:
+    folder = write_colmap(tmp_path)
+    load_capture(folder)  # sound before it is broken
+    breaks, message = BROKEN_COLMAP[name]
+    breaks(folder)
+    with pytest.raises(CaptureError, match=f"^{message}") as caught:
+        load_capture(folder)
+    assert caught.value.remedy
+
+
+BROKEN_TEXT: dict[str, tuple[Break, str]] = {
+    "cut in a camera": (
+        cut("sparse/0/cameras.txt", lambda d: d[:-12]),
+        r"sparse/0/cameras\.txt, line 4: .*4 parameters",
+    ),
+    "cut in a pose": (
+        cut("sparse/0/images.txt", lambda d: d[: d.index(b"frame_0000") - 30]),
+        r"sparse/0/images\.txt, line 5: is no image",
+    ),
+    "cut between images": (
+        cut("sparse/0/images.txt", lambda d: b"\n".join(d.splitlines()[:10]) + b"\n"),
+        r"sparse/0/images\.txt: announces 10 entries and holds 3",
+    ),
+    "cut between points": (
+        cut("sparse/0/points3D.txt", lambda d: b"\n".join(d.splitlines()[:13]) + b"\n"),
+        r"sparse/0/points3D\.txt: announces 40 entries and holds 10",
+    ),
+    "word for a number": (
+        cut("sparse/0/cameras.txt", lambda d: d.replace(b"PINHOLE 32", b"PINHOLE wide")),
+        r"sparse/0/cameras\.txt, line 4: is no camera",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_TEXT)
+def test_broken_text_model_is_refused_with_its_reason(tmp_path: Path, name: str) -> None:
+    folder = write_colmap(tmp_path, text=True)
+    breaks, message = BROKEN_TEXT[name]
+    breaks(folder)
+    with pytest.raises(CaptureError, match=f"^{message}"):
+        load_capture(folder)
+
+
+def test_lens_that_cannot_be_undistorted_is_refused(tmp_path: Path) -> None:
+    write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 1e9, 10.0, 0.1))
+    with pytest.raises(CaptureError, match=r"^sparse/0, cameras: the camera SIMPLE_RADIAL .* cannot be undistorted"):
+        load_capture(tmp_path)
+
+
+def test_distorted_capture_without_pycolmap_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 16.0, 10.0, 0.05))
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(CaptureError, match=r"pip install graings\[colmap\]"):
+        load_capture(tmp_path)
+
+
+def test_pinhole_capture_needs_no_pycolmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_colmap(tmp_path)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert len(load_capture(tmp_path).train) == 7
+
+
+def test_names_without_numbers_give_no_times(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path, text=True)
+    (folder / "images/frame_0030.png").rename(folder / "images/face.png")
+    path = folder / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace("frame_0030.png", "face.png"))
+    with pytest.raises(CaptureError, match=r"^images/face\.png, name: the file name holds no number"):
+        load_capture(folder, CaptureConfig(times_from_names=True))
+
+
+def test_folder_without_a_capture_says_what_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("nothing here")
+    with pytest.raises(CaptureError, match=r"holds no capture: neither transforms_train\.json .* nor a COLMAP model"):
+        load_capture(tmp_path)
+
+
+def test_folder_of_several_captures_names_them(tmp_path: Path) -> None:
+    for name in ("left", "right"):
+        (tmp_path / name).mkdir()
+        write_dnerf(tmp_path / name)
+    with pytest.raises(CaptureError, match=r"holds several captures \(left, right\)"):
+        load_capture(tmp_path)
+
+
+def test_single_transforms_file_says_how_to_rename_it(tmp_path: Path) -> None:
+    write_dnerf(tmp_path)
+    (tmp_path / TRAIN).rename(tmp_path / "transforms.json")
+    with pytest.raises(CaptureError, match=r"Rename it to transforms_train\.json"):
+        load_capture(tmp_path)
+
+
+def test_file_in_place_of_a_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "scene.zip").write_bytes(b"PK")
+    with pytest.raises(CaptureError, match="is not a folder"):
+        load_capture(tmp_path / "scene.zip")

@@ -1,0 +1,159 @@
+"""Units: lengths by a power of two, times to [0, 1], the vertical axis."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graings.camera import Camera
+from graings.capture.load import load_capture
+from graings.capture.normalize import frame_of_reference, vertical
+from tests.capture.captures import entry, orbit, pixels, write_dnerf, write_image, write_transforms
+
+RADIUS = 4.25  # 17 / 4: the poses below stay exact when scaled
+
+
+def ring(scale: float = 1.0, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> list[Camera]:
+    cameras = [orbit(index, 7, radius=RADIUS) for index in range(7)]
+    moved = []
+    for camera in cameras:
+        pose = np.array(camera.world_to_camera)
+        pose[:3, 3] = (pose[:3, 3] - pose[:3, :3] @ np.array(offset)) * scale
+        moved.append(Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height))
+    return moved
+
+
+def test_cameras_on_a_ring_centre_on_what_they_look_at() -> None:
+    center, scale, notes = frame_of_reference(ring(), None)
+    np.testing.assert_allclose(center, 0.0, atol=1e-14)
+    assert scale == 0.25
+    assert notes == []
+
+
+@pytest.mark.parametrize("exponent", [-13, -3, 3, 10, 17])
+def test_capture_scaled_by_a_power_of_two_has_the_same_bits(exponent: int) -> None:
+    factor = 2.0**exponent
+    center, scale, _ = frame_of_reference(ring(), None)
+    scaled_center, scaled_scale, _ = frame_of_reference(ring(factor), None)
+    assert scaled_scale == scale / factor
+    np.testing.assert_array_equal(scaled_center, center * factor)
+
+
+@pytest.mark.parametrize(
+    "radius", [math.sqrt(0.5), math.sqrt(2.0), np.nextafter(math.sqrt(2.0), 0), 1.0, 0.7, 1e-5, 1e5]
+)
+def test_scale_brings_the_radius_within_a_factor_of_root_two(radius: float) -> None:
+    points = radius * np.concatenate([np.eye(3), -np.eye(3)])
+    _, scale, _ = frame_of_reference(ring(1e-9), points)
+    assert 2**-0.5 * (1 - 1e-12) <= scale * radius <= 2**0.5 * (1 + 1e-12)
+
+
+def test_far_from_the_origin_the_centre_follows() -> None:
+    offset = (5e5, 4e6, 300.0)
+    center, scale, _ = frame_of_reference(ring(offset=offset), None)
+    np.testing.assert_allclose(center, offset, atol=1e-8)  # float64 spacing at 4e6 is 9e-10
+    assert scale == 0.25
+
+
+def test_outliers_among_the_points_do_not_move_the_centre() -> None:
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points[:10] = 1e6
+    center, scale, _ = frame_of_reference(ring(), points)
+    assert np.abs(center).max() < 0.3
+    assert scale == 0.25
+
+
+def test_one_camera_has_no_scale() -> None:
+    camera = ring()[0]
+    center, scale, notes = frame_of_reference([camera] * 8, None)
+    np.testing.assert_allclose(center, camera.center + camera.forward, atol=1e-15)
+    assert scale == 1.0
+    assert [note.partition(":")[0] for note in notes] == ["no_scale"]
+
+
+def test_parallel_axes_have_no_parallax_but_keep_their_scale() -> None:
+    cameras = []
+    for x in (-3.0, -1.0, 1.0, 3.0):
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        cameras.append(Camera(pose, 10.0, 10.0, 5.0, 5.0, 10, 10))
+    center, scale, notes = frame_of_reference(cameras, None)
+    np.testing.assert_allclose(center[:2], 0.0, atol=1e-15)
+    assert center[2] > 0
+    assert 0.1 < scale * 3.0 < 1.0
+    assert [note.partition(":")[0] for note in notes] == ["no_parallax"]
+
+
+def test_cameras_looking_outwards_are_centred_on_themselves() -> None:
+    cameras = [
+        Camera.look_at(point, 2 * point, fov=0.7, width=8, height=8)
+        for point in (np.array([math.cos(a), math.sin(a), 0.0]) for a in np.arange(5) * 2 * math.pi / 5)
+    ]
+    center, _, notes = frame_of_reference(cameras, None)
+    assert np.linalg.norm(center) < 1.0
+    assert notes == ["the cameras look outwards: the scene is centred on the cameras"]
+
+
+def test_level_cameras_give_an_exact_vertical_axis() -> None:
+    # Seen from one side only and from above, the mean camera up leans by far more than ten degrees.
+    cameras = [Camera.orbit(a, 50.0, 4.0, fov=0.7, width=8, height=8) for a in (0.0, 20.0, 40.0)]
+    assert vertical(cameras) == (0.0, 0.0, 1.0)
+
+
+def test_tilted_vertical_axis_is_kept() -> None:
+    up = np.array([0.0, 0.6, 0.8])
+    cameras = [Camera.orbit(a, 20.0, 4.0, up=up, fov=0.7, width=8, height=8) for a in range(0, 360, 30)]
+    np.testing.assert_allclose(vertical(cameras), up, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        [0.0, 0.5, 1.0],
+        [5.0, 6.0, 9.0, 7.0],
+        [-3.0, -1.5, -2.0],
+        [1.7e9 + i / 30 for i in range(20)],
+        [1.7e12 + 33 * i for i in range(20)],
+    ],
+    ids=["unit", "from five", "negative", "epoch seconds", "epoch milliseconds"],
+)
+def test_times_are_mapped_to_the_unit_interval_in_double_precision(tmp_path: Path, stamps: list[float]) -> None:
+    capture = load_capture(write_dnerf(tmp_path, stamps))
+    low, high = Fraction(min(stamps)), Fraction(max(stamps))
+    for frame, stamp in zip(capture.train, stamps, strict=True):
+        assert frame.time == pytest.approx(float((Fraction(stamp) - low) / (high - low)), abs=1e-12)
+    assert len(capture.times) == len(stamps)
+    assert capture.times[0] == 0.0
+    assert capture.times[-1] == 1.0
+
+
+def test_order_of_frames_does_not_change_their_times(tmp_path: Path) -> None:
+    stamps = [0.3, 7.0, 1.1, 5.2]
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    forward = {frame.time for frame in load_capture(write_dnerf(tmp_path / "a", stamps)).train}
+    assert {frame.time for frame in load_capture(write_dnerf(tmp_path / "b", stamps[::-1])).train} == forward
+
+
+def test_stamps_closer_than_a_millionth_of_the_range_are_one_instant(tmp_path: Path) -> None:
+    capture = load_capture(write_dnerf(tmp_path, [0.0, 1.0, 1.0 + 1e-9, 1.0, 2.0 - 1e-9, 2.0]))
+    assert capture.times.tolist() == [0.0, pytest.approx(0.5, abs=1e-9), 1.0]
+
+
+def test_chain_of_close_stamps_does_not_collapse(tmp_path: Path) -> None:
+    for index in range(6):
+        write_image(tmp_path / f"train/{index}.png", pixels(12, 12, seed=index))
+    stamps = [0.0, 0.8e-6, 1.6e-6, 2.4e-6, 3.2e-6, 1.0]
+    write_transforms(tmp_path, "train", [entry(orbit(i, 6), f"train/{i}", stamps[i]) for i in range(6)])
+    assert load_capture(tmp_path).times.tolist() == [0.0, 1.6e-6, 3.2e-6, 1.0]
+
+
+def test_single_instant_is_time_zero(tmp_path: Path) -> None:
+    capture = load_capture(write_dnerf(tmp_path, [5.0, 5.0, 5.0]))
+    assert capture.times.tolist() == [0.0]
+    assert capture.units.time_span == 0.0
+    assert any("one time" in note for note in capture.notes)
