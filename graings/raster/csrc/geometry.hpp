@@ -176,8 +176,10 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
             drawn = true;
             sr_[lane] = args.records[i].sr, sy_[lane] = args.records[i].sy, opacity[lane] = double(in.opacities[i]);
             const R* slot = args.sums + args.pair_begin[i] * kSums;
+            double total[kSums] = {};
             for (int64_t pair = 0; pair < args.pair_count[i]; pair++, slot += kSums)
-                for (int q = 0; q < kSums; q++) sums[q][lane] += double(slot[q]);
+                for (int q = 0; q < kSums; q++) total[q] += double(slot[q]);
+            for (int q = 0; q < kSums; q++) sums[q][lane] = total[q];
         }
         if (!drawn) {
             for (int64_t i = group; i < group + kGroup && i < end; i++) {

@@ -21,21 +21,22 @@ GRAINGS_INLINE uint32_t block_mask(const Record<R>& record, double left, double 
     const double highest = __builtin_sqrt(level) / record.sy;
     const double turn = highest * steep / __builtin_sqrt(steep * steep + record.sy * record.sy);
     const double x0 = record.x - left, y0 = record.y - top;
-    alignas(64) double low[8], high[8], sign[8];
-    for (int i = 0; i < 8; i++) {
-        const double first = 4 * (i & 3) + 0.5 - y0;
-        low[i] = at_least(first, -highest), high[i] = at_most(first + 3, highest), sign[i] = i < 4 ? 1 : -1;
-    }
+    // lanes: the four rows of blocks to the right of the mean, then the same rows to the left
     using V = Vec<double, 8>;
-    const V side = load<8>(sign), from = load<8>(low), to = load<8>(high);
+    alignas(64) static constexpr double kFirstRow[8] = {0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5};
+    alignas(64) static constexpr double kSide[8] = {1, 1, 1, 1, -1, -1, -1, -1};
+    const V side = load<8>(kSide), first_row = load<8>(kFirstRow) - splat<double, 8>(y0);
+    const V from = max(first_row, splat<double, 8>(-highest)), to = min(first_row + splat<double, 8>(3), splat<double, 8>(highest));
     const V dy = clamp(side * splat<double, 8>(turn), from, to);
     const V scaled = dy * splat<double, 8>(record.sy);
     const V room = max(splat<double, 8>(level) - scaled * scaled, splat<double, 8>(0));
-    const V edge = splat<double, 8>(x0) + splat<double, 8>(record.slope) * dy + side * sqrt(room) / splat<double, 8>(record.sr);
+    const V edge = splat<double, 8>(x0) + splat<double, 8>(record.slope) * dy + side * sqrt(room) * splat<double, 8>(1 / record.sr);
     // a block column b holds the pixel centres 4b + 0.5 ... 4b + 3.5
     double columns[8];
     store(columns, clamp((edge - select(splat<double, 8>(0) < side, splat<double, 8>(0.5), splat<double, 8>(3.5))) * splat<double, 8>(0.25),
                          splat<double, 8>(-2), splat<double, 8>(5)));
+    double low[8], high[8];
+    store(low, from), store(high, to);
     uint32_t mask = 0;
     for (int row = 0; row < 4; row++) {
         if (!(low[row] <= high[row])) continue;
