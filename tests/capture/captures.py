@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from graings.camera import Camera
 
 FOV = 0.7
+
+Break = Callable[[Path], Any]
 
 
 def pixels(height: int, width: int, channels: int = 4, seed: int = 0) -> NDArray[np.uint8]:
@@ -98,3 +101,8 @@ def write_colmap(
         scene.add_point3D(position, pycolmap.Track(), np.array([255, 51, 0], dtype=np.uint8))
     (scene.write_text if text else scene.write_binary)(str(folder / where))
     return folder
+
+
+def cut(name: str, keep: Callable[[bytes], bytes]) -> Break:
+    """Rewrite a file's bytes."""
+    return lambda folder: (folder / name).write_bytes(keep((folder / name).read_bytes()))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import struct
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,10 @@ import numpy as np
 import pytest
 
 from graings.capture.load import load_capture
-from graings.config import CaptureConfig
 from graings.errors import CaptureError
-from tests.capture.captures import entry, orbit, pixels, write_colmap, write_dnerf, write_image, write_transforms
+from tests.capture.captures import Break, cut, entry, orbit, pixels, write_dnerf, write_image, write_transforms
 
 TIMES = [0.0, 0.25, 0.5, 1.0]
-Break = Callable[[Path], Any]
 TRAIN = "transforms_train.json"
 
 
@@ -50,11 +46,6 @@ def matrix(change: Callable[[np.ndarray], Any]) -> Break:
         document["frames"][2]["transform_matrix"] = pose.tolist()
 
     return edit(apply)
-
-
-def cut(name: str, keep: Callable[[bytes], bytes]) -> Break:
-    """Rewrite a file's bytes."""
-    return lambda folder: (folder / name).write_bytes(keep((folder / name).read_bytes()))
 
 
 def as_jpeg(keep: float) -> Break:
@@ -194,139 +185,6 @@ def test_broken_held_out_split_is_refused_too(tmp_path: Path) -> None:
     write_transforms(tmp_path, "test", [entry(orbit(0, 4), "./test/r_000", 0.5)])
     with pytest.raises(CaptureError, match=r"^transforms_test\.json, frames\[0\]\.file_path: .*is missing"):
         load_capture(tmp_path)
-
-
-def patch(name: str, at: int, layout: str, *values: float) -> Break:
-    """Overwrite numbers in a binary model file."""
-
-    def apply(data: bytes) -> bytes:
-        changed = bytearray(data)
-        struct.pack_into(layout, changed, at, *values)
-        return bytes(changed)
-
-    return cut(name, apply)
-
-
-CAMERAS, IMAGES, POINTS = (f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D"))
-# cameras.bin: count, then id, model, width, height, fx, fy, cx, cy. images.bin: count, then id, quaternion, ...
-BROKEN_COLMAP: dict[str, tuple[Break, str]] = {
-    "missing photograph": (
-        lambda f: (f / "images/frame_0030.png").unlink(),
-        r"sparse/0, image 'frame_0030\.png': .*is missing",
-    ),
-    "missing images.bin": (lambda f: (f / IMAGES).unlink(), rf"{IMAGES}: is missing"),
-    "missing points": (lambda f: (f / POINTS).unlink(), rf"{POINTS}: is missing"),
-    "truncated cameras.bin": (cut(CAMERAS, lambda d: d[:-1]), rf"{CAMERAS}: is truncated"),
-    "truncated images.bin": (cut(IMAGES, lambda d: d[: len(d) // 2]), rf"{IMAGES}: is truncated"),
-    "images.bin cut in a name": (cut(IMAGES, lambda d: d[: 8 + 64 + 5]), rf"{IMAGES}: is truncated"),
-    "truncated points3D.bin": (cut(POINTS, lambda d: d[:-5]), rf"{POINTS}: is truncated"),
-    "empty cameras.bin": (cut(CAMERAS, lambda d: b""), rf"{CAMERAS}: is truncated"),
-    "bytes too many": (cut(CAMERAS, lambda d: d + b"\0\0"), rf"{CAMERAS}: 2 bytes too many"),
-    "absurd count": (patch(POINTS, 0, "<Q", 2**63), rf"{POINTS}: is truncated"),
-    "no images": (cut(IMAGES, lambda d: struct.pack("<Q", 0)), r"sparse/0, images: the model has no registered image"),
-    "unknown camera model": (patch(CAMERAS, 12, "<i", 77), rf"{CAMERAS}: camera 1 has the unknown model 77"),
-    "negative focal length": (patch(CAMERAS, 32, "<d", -30.0), rf"{CAMERAS}: camera 1 needs .*positive focal"),
-    "focal length is not finite": (patch(CAMERAS, 32, "<d", math.nan), rf"{CAMERAS}: camera 1 needs finite"),
-    "camera without a size": (patch(CAMERAS, 16, "<Q", 0), rf"{CAMERAS}: camera 1 has the size 0x20"),
-    "camera of another shape": (patch(CAMERAS, 16, "<Q", 50), r"sparse/0, cameras: the camera is for 50x20 px"),
-    "missing camera": (patch(CAMERAS, 8, "<I", 5), r"sparse/0, cameras: the image .* refers to camera 1"),
-    "zero rotation": (patch(IMAGES, 12, "<4d", 0, 0, 0, 0), rf"{IMAGES}, frame_0000\.png: the rotation is zero"),
-    "pose is not finite": (patch(IMAGES, 44, "<d", math.inf), rf"{IMAGES}, frame_0000\.png: the pose is not finite"),
-    "name leads outside": (
-        cut(IMAGES, lambda d: d.replace(b"frame_0030.png", b"../../0030.png")),
-        r"sparse/0, image '\.\./\.\./0030\.png': .*leads outside",
-    ),
-    "image listed twice": (
-        cut(IMAGES, lambda d: d.replace(b"frame_0030.png", b"frame_0040.png")),
-        r"sparse/0, images: the image frame_0040\.png is listed twice",
-    ),
-    "times without one image": (
-        lambda f: (f / "times.json").write_text('{"frame_0000.png": 1}'),
-        r"times\.json, frame_0010\.png: the time is missing",
-    ),
-    "times that are text": (
-        lambda f: (f / "times.json").write_text('{"frame_0000.png": "NaN"}'),
-        r"times\.json, frame_0000\.png: input should be a valid number",
-    ),
-    "unknown test image": (
-        lambda f: (f / "sparse/0/test.txt").write_text("nobody.png\n"),
-        r"sparse/0/test\.txt: 'nobody\.png' is no image of the model",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN_COLMAP)
-def test_broken_colmap_folder_is_refused_with_its_reason(tmp_path: Path, name: str) -> None:
-    folder = write_colmap(tmp_path)
-    load_capture(folder)  # sound before it is broken
-    breaks, message = BROKEN_COLMAP[name]
-    breaks(folder)
-    with pytest.raises(CaptureError, match=f"^{message}") as caught:
-        load_capture(folder)
-    assert caught.value.remedy
-
-
-BROKEN_TEXT: dict[str, tuple[Break, str]] = {
-    "cut in a camera": (
-        cut("sparse/0/cameras.txt", lambda d: d[:-12]),
-        r"sparse/0/cameras\.txt, line 4: .*4 parameters",
-    ),
-    "cut in a pose": (
-        cut("sparse/0/images.txt", lambda d: d[: d.index(b"frame_0000") - 30]),
-        r"sparse/0/images\.txt, line 5: is no image",
-    ),
-    "cut between images": (
-        cut("sparse/0/images.txt", lambda d: b"\n".join(d.splitlines()[:10]) + b"\n"),
-        r"sparse/0/images\.txt: announces 10 entries and holds 3",
-    ),
-    "cut between points": (
-        cut("sparse/0/points3D.txt", lambda d: b"\n".join(d.splitlines()[:13]) + b"\n"),
-        r"sparse/0/points3D\.txt: announces 40 entries and holds 10",
-    ),
-    "word for a number": (
-        cut("sparse/0/cameras.txt", lambda d: d.replace(b"PINHOLE 32", b"PINHOLE wide")),
-        r"sparse/0/cameras\.txt, line 4: is no camera",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN_TEXT)
-def test_broken_text_model_is_refused_with_its_reason(tmp_path: Path, name: str) -> None:
-    folder = write_colmap(tmp_path, text=True)
-    breaks, message = BROKEN_TEXT[name]
-    breaks(folder)
-    with pytest.raises(CaptureError, match=f"^{message}"):
-        load_capture(folder)
-
-
-def test_lens_that_cannot_be_undistorted_is_refused(tmp_path: Path) -> None:
-    write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 1e9, 10.0, 0.1))
-    with pytest.raises(CaptureError, match=r"^sparse/0, cameras: the camera SIMPLE_RADIAL .* cannot be undistorted"):
-        load_capture(tmp_path)
-
-
-def test_distorted_capture_without_pycolmap_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 16.0, 10.0, 0.05))
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(CaptureError, match=r"pip install graings\[colmap\]"):
-        load_capture(tmp_path)
-
-
-def test_pinhole_capture_needs_no_pycolmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_colmap(tmp_path)
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert len(load_capture(tmp_path).train) == 7
-
-
-def test_names_without_numbers_give_no_times(tmp_path: Path) -> None:
-    folder = write_colmap(tmp_path, text=True)
-    (folder / "images/frame_0030.png").rename(folder / "images/face.png")
-    path = folder / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace("frame_0030.png", "face.png"))
-    with pytest.raises(CaptureError, match=r"^images/face\.png, name: the file name holds no number"):
-        load_capture(folder, CaptureConfig(times_from_names=True))
 
 
 def test_folder_without_a_capture_says_what_was_looked_for(tmp_path: Path) -> None:
