@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import FunctionCtx, once_differentiable
+from torch.autograd.function import once_differentiable
 
 from graings.camera import Camera
 from graings.gaussians import Gaussians
@@ -119,7 +119,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, v_color: Tensor | None, v_alpha: Tensor | None, v_depth: Tensor | None, *_: FunctionCtx
+        ctx: Any, v_color: Tensor | None, v_alpha: Tensor | None, v_depth: Tensor | None, *_: Tensor | None
     ) -> tuple[Tensor | None, ...]:
         nothing: tuple[None, ...] = (None,) * 11
         if v_color is None and v_alpha is None and v_depth is None:

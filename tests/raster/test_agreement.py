@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
 
-from graings.raster import kernel, reference
+from graings.raster import reference
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
 from tests.raster.comparison import UNIT_ROUNDOFF, decisions, draw, relative, upstream
-from tests.scenes import SCENES, cast, gaussians, overlapping, pinhole, wide
+from tests.scenes import SCENES, Scene, cast, gaussians, overlapping, pinhole, wide
 
 # Norm-wise, per group of parameters: fifty times the 4e-7 measured for float32 pixels over float64 geometry.
 GRADIENT_BOUND = 2e-5
@@ -20,16 +20,8 @@ GRADIENT_BOUND = 2e-5
 SIZES = [(1, 1), (1, 7), (7, 1), (15, 15), (16, 16), (17, 33), (33, 47), (257, 1)]
 
 
-@pytest.fixture(params=kernel.available_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = kernel.active_isa()
-    kernel.use_isa(request.param)
-    yield request.param
-    kernel.use_isa(before)
-
-
-def assert_double_agrees(scene: object, settings: RasterSettings = DEFAULT_SETTINGS) -> None:
-    batch, camera = scene  # type: ignore[misc]
+def assert_double_agrees(scene: Scene, settings: RasterSettings = DEFAULT_SETTINGS) -> None:
+    batch, camera = scene
     cotangent = upstream(camera)
     ours = draw(rasterize, batch, camera, cotangent, settings=settings)
     oracle = draw(reference.rasterize, batch, camera, cotangent, settings=settings)
@@ -63,8 +55,10 @@ def test_double_kernel_equals_oracle_at_any_image_size(size: tuple[int, int]) ->
     ids=["untruncated", "compat", "unusual"],
 )
 @pytest.mark.parametrize("build", [overlapping, wide])
-def test_double_kernel_equals_oracle_with_other_settings(build: object, settings: RasterSettings, isa: str) -> None:
-    assert_double_agrees(build(), settings)  # type: ignore[operator]
+def test_double_kernel_equals_oracle_with_other_settings(
+    build: Callable[[], Scene], settings: RasterSettings, isa: str
+) -> None:
+    assert_double_agrees(build(), settings)
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
-from graings.raster import kernel, ssim_reference
+from graings.raster import ssim_reference
 from graings.raster.ssim import ssim
 from tests.raster.comparison import UNIT_ROUNDOFF, relative
 
 SIZES = [(1, 1), (1, 7), (5, 5), (17, 33), (33, 47), (40, 3)]
-
-
-@pytest.fixture(params=kernel.available_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = kernel.active_isa()
-    kernel.use_isa(request.param)
-    yield request.param
-    kernel.use_isa(before)
 
 
 def pair(height: int, width: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -30,9 +22,11 @@ def pair(height: int, width: int, dtype: torch.dtype = torch.float64) -> tuple[T
     return image.to(dtype), target.to(dtype)
 
 
-def with_gradient(function: object, image: Tensor, target: Tensor, **options: int) -> tuple[Tensor, Tensor]:
+def with_gradient(
+    function: Callable[..., Tensor], image: Tensor, target: Tensor, **options: int
+) -> tuple[Tensor, Tensor]:
     leaf = image.clone().requires_grad_()
-    value = function(leaf, target, **options)  # type: ignore[operator]
+    value = function(leaf, target, **options)
     (gradient,) = torch.autograd.grad(value, leaf)
     return value.detach(), gradient
 
