@@ -1,0 +1,154 @@
+"""What strangers may send. Each archive is really built, and really refused."""
+
+from __future__ import annotations
+
+import io
+import os
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from service.archives import Limits, unpack
+from service.problems import ArchiveError
+
+LIMITS = Limits(files=50, bytes=50_000_000)
+
+
+def zipped(path: Path, entries: dict[str, bytes], **options: int) -> Path:
+    with zipfile.ZipFile(path, "w", **options) as archive:  # type: ignore[arg-type]
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return path
+
+
+def tarred(path: Path, *members: tuple[tarfile.TarInfo, bytes], mode: str = "w") -> Path:
+    with tarfile.open(path, mode) as archive:  # type: ignore[call-overload]
+        for info, content in members:
+            info.size = len(content)
+            archive.addfile(info, io.BytesIO(content))
+    return path
+
+
+def member(name: str, kind: bytes = tarfile.REGTYPE, link: str = "") -> tarfile.TarInfo:
+    info = tarfile.TarInfo(name)
+    info.type = kind
+    info.linkname = link
+    return info
+
+
+def refused(archive: Path, limits: Limits = LIMITS) -> str:
+    """The message with which an archive is refused; nothing may be left of it, inside or outside of its folder."""
+    before = sorted(archive.parent.rglob("*"))
+    with pytest.raises(ArchiveError) as caught:
+        unpack(archive, archive.parent / "out", limits)
+    assert sorted(archive.parent.rglob("*")) == before
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("mode", ["zip", "w", "w:gz"])
+def test_a_capture_comes_out_as_it_went_in(tmp_path: Path, mode: str) -> None:
+    files = {"scene/transforms_train.json": b"{}", "scene/train/r_0.png": os.urandom(3_000)}
+    if mode == "zip":
+        archive = zipped(tmp_path / "a", files, compression=zipfile.ZIP_DEFLATED)
+    else:
+        archive = tarred(tmp_path / "a", *((member(name), content) for name, content in files.items()), mode=mode)
+    found = unpack(archive, tmp_path / "out", LIMITS)
+    assert (found.files, found.bytes, found.skipped) == (2, 3_002, 0)
+    assert {str(p.relative_to(tmp_path / "out")): p.read_bytes() for p in (tmp_path / "out").rglob("*.*")} == files
+
+
+def test_files_that_no_capture_has_are_left_out(tmp_path: Path) -> None:
+    files = {"a.json": b"{}", "run.sh": b"#!", "__MACOSX/a.json": b"x", ".git/b.json": b"x", "noending": b"x"}
+    found = unpack(zipped(tmp_path / "a", files), tmp_path / "out", LIMITS)
+    assert (found.files, found.skipped) == (1, 4)
+    assert [path.name for path in (tmp_path / "out").rglob("*")] == ["a.json"]
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil.json", "a/../../evil.json", "/evil.json", "..\\evil.json", "C:\\evil.json", "a\nb.json"]
+)
+def test_a_path_that_leads_out_is_refused(tmp_path: Path, name: str) -> None:
+    assert "outside" in refused(zipped(tmp_path / "a", {"good.json": b"{}", name: b"{}"}))
+    (tmp_path / "a").unlink()
+    assert "outside" in refused(tarred(tmp_path / "a", (member("good.json"), b"{}"), (member(name), b"{}")))
+
+
+@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.FIFOTYPE])
+def test_links_and_devices_in_a_tar_are_refused(tmp_path: Path, kind: bytes) -> None:
+    assert "plain files" in refused(tarred(tmp_path / "a", (member("x.json", kind, "/etc/passwd"), b"")))
+
+
+def test_a_symbolic_link_in_a_zip_is_refused(tmp_path: Path) -> None:
+    info = zipfile.ZipInfo("x.json")
+    info.external_attr = 0o120777 << 16
+    with zipfile.ZipFile(tmp_path / "a", "w") as archive:
+        archive.writestr(info, "/etc/passwd")
+    assert "plain files" in refused(tmp_path / "a")
+
+
+def test_a_bomb_is_refused_by_its_ratio_and_by_its_size(tmp_path: Path) -> None:
+    bomb = {"zeros.json": bytes(30_000_000)}
+    archive = zipped(tmp_path / "a", bomb, compression=zipfile.ZIP_DEFLATED)
+    assert "times its size" in refused(archive)
+    assert "more than 1000 bytes" in refused(archive, Limits(files=9, bytes=1_000))
+    archive.unlink()
+    archive = tarred(tmp_path / "a", (member("zeros.unwanted"), bytes(2_000_000)), mode="w:gz")
+    assert "more than 1000 bytes" in refused(archive, Limits(files=9, bytes=1_000))
+
+
+def test_a_zip_that_lies_about_sizes_is_refused(tmp_path: Path) -> None:
+    archive = zipped(tmp_path / "a", {"a.json": b"x" * 5_000}, compression=zipfile.ZIP_DEFLATED)
+    content = archive.read_bytes()
+    claimed = (5_000).to_bytes(4, "little")
+    assert content.count(claimed) == 2  # in the local header and in the directory
+    archive.write_bytes(content.replace(claimed, (100).to_bytes(4, "little")))
+    assert "damaged" in refused(archive)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.99])
+@pytest.mark.parametrize("kind", ["zip", "tar.gz"])
+def test_a_truncated_archive_is_refused(tmp_path: Path, kind: str, share: float) -> None:
+    noise = os.urandom(20_000)
+    if kind == "zip":
+        archive = zipped(tmp_path / "a", {"a.json": noise, "b.json": noise})
+    else:
+        archive = tarred(tmp_path / "a", (member("a.json"), noise), (member("b.json"), noise), mode="w:gz")
+    content = archive.read_bytes()
+    archive.write_bytes(content[: int(share * len(content))])
+    assert "damaged" in refused(archive)
+
+
+def test_an_encrypted_entry_is_refused(tmp_path: Path) -> None:
+    archive = zipped(tmp_path / "a", {"a.json": b"{}"})
+    content = bytearray(archive.read_bytes())
+    for signature, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        content[content.index(signature) + flags] |= 1
+    archive.write_bytes(content)
+    assert "password" in refused(archive)
+
+
+def test_names_that_collide_are_refused(tmp_path: Path) -> None:
+    assert "twice" in refused(zipped(tmp_path / "a", {"A/x.json": b"1", "a/X.json": b"2"}))
+    (tmp_path / "a").unlink()
+    assert "both a file and a folder" in refused(zipped(tmp_path / "a", {"x.json": b"1", "x.json/y.json": b"2"}))
+
+
+def test_what_is_no_archive_or_holds_nothing_is_refused(tmp_path: Path) -> None:
+    for content, word in (
+        (b"", "no archive"),
+        (b"hello", "no archive"),
+        (b"PK\x03\x04", "damaged"),
+        (b"\x1f\x8bx", "damaged"),
+    ):
+        (tmp_path / "a").write_bytes(content)
+        assert word in refused(tmp_path / "a")
+    assert "no file of a capture" in refused(zipped(tmp_path / "a", {"readme.md": b"hello"}))
+
+
+def test_too_many_entries_are_refused(tmp_path: Path) -> None:
+    many = {f"{i}.json": b"{}" for i in range(51)}
+    assert "more than 50 entries" in refused(zipped(tmp_path / "a", many))
+    (tmp_path / "a").unlink()
+    assert "more than 50 entries" in refused(tarred(tmp_path / "a", *((member(name), b"") for name in many)))

@@ -1,0 +1,169 @@
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from jobs.engine import Engine
+from jobs.store import JobFolder
+from service.app import create_app
+from service.settings import Settings
+
+
+def problem(answer: Any, status: int) -> dict[str, Any]:
+    """The problem document of an answer."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    document: dict[str, Any] = answer.json()
+    assert document["status"] == status
+    assert document["title"]
+    return document
+
+
+def left_behind(settings: Settings) -> list[Path]:
+    return [path for part in ("uploads", "captures", "jobs") for path in (settings.data / part).iterdir()]
+
+
+def test_a_submitted_capture_becomes_a_queued_job(client: TestClient, archive: bytes, settings: Settings) -> None:
+    query = {"preset": "draft", "name": "moving", "priority": 3, "config": '{"iterations": 50, "loss.ssim": 0.1}'}
+    answer = client.post("/jobs", params=query, content=archive, headers={"Content-Type": "application/zip"})
+    assert answer.status_code == 202
+    job = answer.json()
+    assert answer.headers["location"] == job["links"]["self"] == f"/jobs/{job['id']}"
+    assert (job["state"], job["name"], job["priority"], job["attempts"]) == ("queued", "moving", 3, 0)
+    assert (job["config"]["iterations"], job["config"]["loss"]["ssim"], job["config"]["preset"]) == (50, 0.1, "draft")
+    assert client.get(job["links"]["self"]).json() == job
+    assert list((settings.data / "uploads").iterdir()) == []
+
+
+def test_a_form_with_a_file_and_options_does_the_same(client: TestClient, archive: bytes) -> None:
+    form = {"config": json.dumps({"iterations": 70, "preset": "paper"})}
+    answer = client.post("/jobs", params={"config": '{"iterations": 60}'}, files={"capture": archive}, data=form)
+    assert answer.status_code == 202, answer.text
+    assert (answer.json()["config"]["iterations"], answer.json()["config"]["preset"]) == (70, "paper")
+
+
+@pytest.mark.parametrize(
+    ("query", "word"),
+    [
+        ({"preset": "best"}, "best"),
+        ({"config": "{"}, "not JSON"),
+        ({"config": "[1]"}, "object"),
+        ({"config": '{"iterations": NaN}'}, "NaN"),
+        ({"config": '{"iterations": 0}'}, "iterations"),
+        ({"config": '{"itrations": 5}'}, "itrations"),
+        ({"config": '{"loss": {"ssim": 1e999}}'}, "loss.ssim"),
+        ({"priority": "0"}, "priority"),
+        ({"name": ""}, "name"),
+    ],
+)
+def test_wrong_options_are_refused_by_name(
+    client: TestClient, archive: bytes, settings: Settings, query: dict[str, str], word: str
+) -> None:
+    assert word in problem(client.post("/jobs", params=query, content=archive), 422)["detail"]
+    assert left_behind(settings) == []
+
+
+def test_wrong_options_in_a_form_are_refused_and_leave_nothing(
+    client: TestClient, archive: bytes, settings: Settings
+) -> None:
+    for form in ({"config": "{"}, {"config": '{"iterations": -1}'}):
+        problem(client.post("/jobs", files={"capture": archive}, data=form), 422)
+    assert "capture" in problem(client.post("/jobs", files={"file": archive}), 422)["detail"]
+    assert left_behind(settings) == []
+
+
+def test_a_bad_archive_is_refused_and_leaves_nothing(client: TestClient, settings: Settings) -> None:
+    memory = io.BytesIO()
+    with zipfile.ZipFile(memory, "w") as archive:
+        archive.writestr("good.json", "{}")
+        archive.writestr("../evil.json", "{}")
+    document = problem(client.post("/jobs", content=memory.getvalue()), 422)
+    assert document["type"] == "urn:graings:problem:capture-rejected"
+    problem(client.post("/jobs", content=b"hello"), 422)
+    problem(client.post("/jobs"), 422)
+    assert left_behind(settings) == []
+
+
+def test_a_body_that_is_too_large_is_refused_whether_it_says_so_or_not(client: TestClient, settings: Settings) -> None:
+    large = bytes(1_000_001)
+    problem(client.post("/jobs", content=large), 413)
+    problem(client.post("/jobs", content=iter([large[:600_000], large[:600_000]])), 413)  # chunked
+    problem(client.post("/jobs", files={"capture": large}), 413)
+    problem(client.post("/jobs/0123456789abcdef/cancel", content=large), 413)
+    assert left_behind(settings) == []
+
+
+def test_jobs_are_listed_in_pages_newest_first(client: TestClient, archive: bytes) -> None:
+    ids = [client.post("/jobs", params={"name": f"n{i}"}, content=archive).json()["id"] for i in range(5)]
+    found, path = [], "/jobs?limit=2"
+    while path:
+        page = client.get(path).json()
+        assert len(page["jobs"]) <= 2
+        found += [job["id"] for job in page["jobs"]]
+        path = page["next"]
+    assert found == sorted(ids, reverse=True)
+    problem(client.get("/jobs?limit=0"), 422)
+    problem(client.get("/jobs?cursor=../x"), 422)
+
+
+def test_steering_follows_the_state_and_may_be_repeated(client: TestClient, job: str) -> None:
+    def post(verb: str) -> Any:
+        return client.post(f"/jobs/{job}/{verb}")
+
+    for verb in ("resume", "retry"):  # it waits already
+        assert (post(verb).status_code, post(verb).json()["state"]) == (202, "queued")
+    for _ in range(2):
+        assert (post("cancel").status_code, post("cancel").json()["state"]) == (202, "cancelled")
+    assert "resume" in problem(post("retry"), 409)["detail"]
+    assert "resume" in client.get(f"/jobs/{job}").json()["links"]
+    assert post("resume").json()["state"] == "queued"
+    assert client.delete(f"/jobs/{job}").status_code == 204
+    for answer in (client.get(f"/jobs/{job}"), client.delete(f"/jobs/{job}"), post("cancel")):
+        problem(answer, 404)
+
+
+@pytest.mark.parametrize("path", ["", "/metrics", "/log", "/events", "/curve.svg"])
+@pytest.mark.parametrize("job_id", ["0123456789abcdef", "..%2f..%2fetc", "x"])
+def test_an_unknown_job_is_a_404_everywhere(client: TestClient, job_id: str, path: str) -> None:
+    problem(client.get(f"/jobs/{job_id}{path}"), 404)
+
+
+def test_metrics_and_curve_come_when_there_are_any(client: TestClient, job: str, folder: JobFolder) -> None:
+    for path in ("metrics", "curve.svg"):
+        assert problem(client.get(f"/jobs/{job}/{path}"), 404)["type"] == "urn:graings:problem:not-yet"
+        assert path.split(".")[0] not in client.get(f"/jobs/{job}").json()["links"]
+
+
+def test_metrics_and_curve_of_a_trained_job(client: TestClient, model: str) -> None:
+    links = client.get(f"/jobs/{model}").json()["links"]
+    metrics = client.get(links["metrics"])
+    assert metrics.json()["schema"] == "graings.metrics/1"
+    assert metrics.headers["content-type"] == "application/json"
+    curve = client.get(links["curve"])
+    assert curve.headers["content-type"] == "image/svg+xml"
+    assert "<svg" in curve.text
+
+
+def test_the_log_shows_its_last_lines(client: TestClient, job: str, folder: JobFolder) -> None:
+    assert client.get(f"/jobs/{job}/log").text == ""
+    folder.log.write_text("one\ntwo\nthree\n")
+    assert client.get(f"/jobs/{job}/log").text == "one\ntwo\nthree\n"
+    assert client.get(f"/jobs/{job}/log?tail=2").text == "two\nthree\n"
+    problem(client.get(f"/jobs/{job}/log?tail=-1"), 422)
+
+
+def test_a_job_stored_but_not_queued_is_queued_at_the_next_start(settings: Settings, archive: bytes) -> None:
+    with TestClient(create_app(settings)) as client:
+        job = client.post("/jobs", content=archive).json()["id"]
+    engine = Engine(settings.database_url)
+    engine.delete(job)
+    assert engine.waiting() == 0
+    with TestClient(create_app(settings)):
+        assert engine.waiting() == 1
+    engine.close()

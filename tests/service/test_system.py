@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import re
+
+import pytest
+from starlette.testclient import TestClient
+
+from graings.config import TrainConfig
+from graings.errors import ConfigError
+from jobs.lease import FileLeases
+from jobs.store import Store
+from service.app import create_app
+from service.settings import Settings
+from tests.service.test_jobs import problem
+
+
+def test_the_options_are_those_of_training(client: TestClient) -> None:
+    document = client.get("/options").json()
+    assert document["schema"]["properties"].keys() == TrainConfig.model_fields.keys()
+    assert document["presets"]["paper"]["iterations"] == 30_000
+
+
+def test_health_and_readiness(client: TestClient, job: str, settings: Settings) -> None:
+    assert client.get("/healthz").json() == {"status": "ok"}
+    found = client.get("/readyz").json()
+    assert (found["ready"], found["workers"], found["waiting"]) == (True, 0, 1)
+    leases = FileLeases(Store(settings.data).workers)
+    assert leases.take("worker-a")
+    assert client.get("/readyz").json()["workers"] == 1
+    leases.close()
+
+
+def test_a_full_disk_is_not_ready(settings: Settings) -> None:
+    with TestClient(create_app(settings.model_copy(update={"min_free_mb": 10**9}))) as client:
+        assert "free" in problem(client.get("/readyz"), 503)["detail"]
+
+
+def test_the_page_needs_nothing_from_anywhere_else(client: TestClient) -> None:
+    page = client.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert "default-src 'self'" in page.headers["content-security-policy"]
+    loaded = re.findall(r'(?:src|href)="([^"]+)"', page.text)
+    assert {"/web/page.js", "/web/style.css", "/web/icon.svg"} <= set(loaded)
+    for address in loaded:
+        assert address.startswith("/")
+        assert client.get(address).status_code == 200
+    for part in ("page.js", "style.css"):
+        assert "http" not in client.get(f"/web/{part}").text.replace("XMLHttpRequest", "")
+
+
+def test_every_operation_is_named_and_every_error_described(client: TestClient) -> None:
+    operations = [one for path in client.get("/openapi.json").json()["paths"].values() for one in path.values()]
+    names = [one["operationId"] for one in operations]
+    assert len(set(names)) == len(names) >= 15
+    assert all(re.fullmatch("[a-z_]+", name) for name in names)
+
+
+def test_settings_come_from_the_environment_and_what_is_given_wins() -> None:
+    settings = Settings.from_environment(
+        {"GRAINGS_PORT": "81", "GRAINGS_HOST": "::1", "OTHER": "x"}, port=82, host=None
+    )
+    assert (settings.port, settings.host) == (82, "::1")
+    assert settings.database_url.startswith("sqlite:///")
+    with pytest.raises(ConfigError, match="GRAINGS_RENDER_SLOTS"):
+        Settings.from_environment({"GRAINGS_RENDER_SLOTS": "none"})
+
+
+def test_the_service_listens_to_this_machine_only_unless_told() -> None:
+    assert Settings().host == "127.0.0.1"
