@@ -36,8 +36,6 @@ from jobs.store import JobFolder, Store
 REPORT_EVERY_S = 1.0
 LOG_EVERY_S = 15.0
 LOCK_WAIT_S = 60.0
-# The service renders on the same cores; whoever looks should not wait for training.
-NICENESS = 5
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,7 +49,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     watch_parent(stop.set)
-    os.nice(NICENESS)
     folder = JobFolder(arguments.folder.resolve())
     deadline = time.monotonic() + LOCK_WAIT_S
     while not stop.is_set():
