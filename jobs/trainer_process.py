@@ -95,10 +95,13 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     _log(f"attempt {attempt}: {threads} threads, from iteration {checkpoint or 0} of {config.iterations}")
 
     reported = logged = -LOG_EVERY_S
+    held_out: dict[str, Any] = {}
     for report in run:
         now = time.monotonic()
+        if report.evaluation:
+            held_out = {"held_out_psnr": report.evaluation.psnr, "held_out_ssim_3dgs": report.evaluation.ssim_3dgs}
         if now - reported >= REPORT_EVERY_S or report.evaluation or report.iteration == report.iterations:
-            progress.write({**_values(report), "attempt": attempt})
+            progress.write({**_values(report), **held_out, "attempt": attempt})
             reported = now
         if now - logged >= LOG_EVERY_S or report.evaluation or report.events:
             _log(_line(report))
@@ -113,7 +116,7 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
 
 def _values(report: StepReport) -> dict[str, Any]:
     speed = report.iterations_per_s
-    values: dict[str, Any] = {
+    return {
         "phase": report.phase,
         "iteration": report.iteration,
         "iterations": report.iterations,
@@ -125,9 +128,6 @@ def _values(report: StepReport) -> dict[str, Any]:
         "eta_s": (report.iterations - report.iteration) / speed if speed > 0 else None,
         "train_s": report.train_s,
     }
-    if report.evaluation:
-        values |= {"held_out_psnr": report.evaluation.psnr, "held_out_ssim_3dgs": report.evaluation.ssim_3dgs}
-    return values
 
 
 def _line(report: StepReport) -> str:

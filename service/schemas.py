@@ -24,7 +24,7 @@ class ProgressResource(BaseModel):
     iterations_per_s: float | None = None
     eta_s: float | None = Field(None, description="Seconds of training left at this speed.")
     train_s: float | None = Field(None, description="Seconds trained so far, evaluations not counted.")
-    held_out_psnr: float | None = Field(None, description="Only in the report that follows an evaluation, in dB.")
+    held_out_psnr: float | None = Field(None, description="Of the last evaluation of this attempt, in dB.")
     held_out_ssim_3dgs: float | None = None
 
 

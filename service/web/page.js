@@ -66,11 +66,11 @@ function draw() {
 function summary(job) {
   const report = job.progress;
   if (job.state === "queued") return report ? `waiting, goes on from ${count(job.checkpoint || 0)}` : "waiting for a worker";
-  if (!report) return ago(job.created_at);
+  if (!report) return job.state === "running" ? "starting" : ago(job.created_at);
   const done = `${count(report.iteration)} of ${count(report.iterations)}`;
   if (job.state !== "running") return `${done} · ${ago(job.finished_at || job.created_at)}`;
   if (report.phase === "loading") return "loading the capture";
-  return report.eta_s === null ? done : `${done} · ${span(report.eta_s)} left`;
+  return report.eta_s == null ? done : `${done} · ${span(report.eta_s)} left`;
 }
 
 function choose(id) {
@@ -99,9 +99,7 @@ function follow(id) {
   stream.addEventListener("progress", (event) => {
     const job = known.get(id);
     if (!job) return;
-    const report = JSON.parse(event.data);
-    const held = report.held_out_psnr ?? job.progress?.held_out_psnr ?? null;
-    update({ ...job, progress: { ...report, held_out_psnr: held } });
+    update({ ...job, progress: JSON.parse(event.data) });
     if (Date.now() - refreshed > LIST_EVERY_MS) {
       refreshed = Date.now();
       ask(`/jobs/${id}`).then((fresh) => current === id && update({ ...fresh, progress: known.get(id).progress }), complain);

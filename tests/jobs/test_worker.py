@@ -44,9 +44,10 @@ def submit(jobs: JobQueue, options: dict[str, object], name: str = "job") -> str
 
 
 @contextmanager
-def working(jobs: JobQueue) -> Iterator[subprocess.Popen[bytes]]:
+def working(jobs: JobQueue, url: str | None = None) -> Iterator[subprocess.Popen[bytes]]:
     """A worker process; interrupted at the end unless it has ended by then."""
     command = [sys.executable, "-m", "jobs.commands", "--data", str(jobs.store.root), "--threads", "1"]
+    command += [] if url is None else ["--database", url]
     with subprocess.Popen(command) as process:
         try:
             yield process
