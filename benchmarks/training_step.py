@@ -96,7 +96,7 @@ def main() -> None:
         whole.append(1e3 * (time.perf_counter() - started))
     camera = run.capture.train[0].camera
     print(
-        f"{camera.width}x{camera.height} px, iteration {trainer.iteration}, {statistics.median(counts):.0f} Gaussians drawn, "
+        f"{camera.width}x{camera.height} px, iteration {trainer.iteration}, {statistics.median(counts):.0f} drawn, "
         f"{trainer.scene.scaffold.count} anchors, {torch.get_num_threads()} threads, median of {arguments.steps} steps"
     )
     total = 0.0

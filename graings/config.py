@@ -71,7 +71,7 @@ class SceneConfig(Part):
 class InitConfig(Part):
     """The first anchors. Owner: `graings.training.initialize`."""
 
-    points: int = Field(20_000, ge=16, le=2_000_000, description="Random points where the capture has no cloud.")
+    points: int = Field(60_000, ge=16, le=2_000_000, description="Random points where the capture has no cloud.")
     carve_vote: float = Field(0.6, ge=0, le=1, description="Share of views whose mask a random point must hit to stay.")
     max_points: int = Field(60_000, ge=16, description="At most this many points of a given cloud are used.")
     voxel_size: float | None = Field(
@@ -106,7 +106,10 @@ class DensityConfig(Part):
     min_observations: int = Field(40, ge=0, description="tau_obs, times a child must have been drawn (not scaled).")
     levels: int = Field(3, ge=1, le=6, description="Cell sizes 4^(levels-1) v ... v.")
     newborn_opacity: float | None = Field(
-        0.05, gt=0.004, lt=0.99, description="Opacity score of a new anchor's brightest child; null inherits the parent's."
+        0.05,
+        gt=0.004,
+        lt=0.99,
+        description="Opacity score of a new anchor's brightest child; null inherits the parent's.",
     )
     max_anchors: int = Field(12_000, ge=16, description="Hard budget of anchors; the largest gradients win.")
     prune_from: int = Field(24_600, ge=0, description="First pruning: 80 % of the joint phase.")
@@ -121,7 +124,7 @@ class DensityConfig(Part):
 class RatesConfig(Part):
     """Adam learning rates, first and last (log-linear between). Owner: `graings.training.optimizer`."""
 
-    offsets: tuple[float, float] = (0.01, 1e-4)
+    offsets: tuple[float, float] = (0.02, 2e-4)
     features: tuple[float, float] = (0.0075, 0.0075)
     log_scales: tuple[float, float] = (0.007, 0.007)
     opacity_offsets: tuple[float, float] = (0.02, 0.002)
@@ -129,7 +132,7 @@ class RatesConfig(Part):
     color: tuple[float, float] = (0.008, 5e-5)
     opacity: tuple[float, float] = (0.002, 2e-5)
     residual: tuple[float, float] = (0.002, 2e-5)
-    deformation: tuple[float, float] = (1.6e-3, 1.6e-5)
+    deformation: tuple[float, float] = (2e-3, 2e-5)
 
 
 class EvaluationConfig(Part):
@@ -145,7 +148,7 @@ class TrainConfig(Part):
     """One training run."""
 
     preset: Literal["draft", "standard", "paper"] = Field("standard", description="Where the defaults come from.")
-    iterations: int = Field(10_000, ge=1, le=1_000_000, description="Optimisation steps.")
+    iterations: int = Field(15_000, ge=1, le=1_000_000, description="Optimisation steps.")
     warmup: int = Field(3_000, ge=0, description="Static warm-up T_w, of the 30 000 schedule.")
     seed: int = Field(0, ge=0, lt=2**31, description="Seed of every random stream.")
     threads: int | None = Field(None, ge=1, le=256, description="CPU threads; null takes all cores.")
@@ -163,8 +166,13 @@ class TrainConfig(Part):
 
 
 PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {"iterations": 2_000, "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 6_000}},
-    "standard": {"iterations": 10_000},
+    "draft": {
+        "iterations": 2_000,
+        "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 6_000},
+        # Few steps must carry far.
+        "rates": {"offsets": (0.03, 3e-4), "deformation": (5e-3, 3e-4)},
+    },
+    "standard": {"iterations": 15_000},
     "paper": {"iterations": PAPER_ITERATIONS},
 }
 
