@@ -33,13 +33,8 @@ from jobs.job import JobState
 
 # A minute or so of training on two cores.
 PRESET = "draft"
-OPTIONS: dict[str, Any] = {
-    "iterations": 800,
-    "capture.max_side": 200,
-    "init.points": 8_000,
-    "density.max_anchors": 3_000,
-}
-CAPTURE: dict[str, int] = {"frames": 60, "size": 200, "bodies": 4}
+OPTIONS: dict[str, Any] = {"iterations": 1_500, "init.points": 4_000, "density.max_anchors": 2_500}
+CAPTURE: dict[str, int] = {"frames": 80, "size": 128, "bodies": 3}
 
 TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
 VIEWPOINTS: dict[str, dict[str, object]] = {
