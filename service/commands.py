@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -53,6 +54,10 @@ def serve(
     def leave() -> None:
         server.should_exit = True
 
+    # The server answers signals itself and raises them once more when it has ended; what is left to do then must not
+    # be cut short by that.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: leave())
     if exit_with_parent:
         watch_parent(leave)
     with ExitStack() as stack:

@@ -1,0 +1,51 @@
+"""The service as a process of its own, with its worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+LONG_S = 60.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+def test_an_interrupted_service_takes_its_worker_along(tmp_path: Path, number: signal.Signals) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "service.commands", "--with-worker", "--data", str(tmp_path), "--port", str(port)]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            while readiness(port).get("workers") != 1:
+                assert process.poll() is None
+            (lease,) = (tmp_path / "workers").iterdir()
+            worker = int(lease.stem.split("-")[-2])
+            os.kill(worker, 0)  # it lives
+            process.send_signal(number)
+            assert process.wait(LONG_S) == 0
+            with pytest.raises(ProcessLookupError):
+                os.kill(worker, 0)
+        finally:
+            process.terminate()
+
+
+def readiness(port: int) -> dict[str, Any]:
+    """What /readyz says; nothing while nobody listens."""
+    time.sleep(0.1)
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=10) as answer:
+            found: dict[str, Any] = json.load(answer)
+            return found
+    except urllib.error.URLError:
+        return {}
