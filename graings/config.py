@@ -106,10 +106,10 @@ class DensityConfig(Part):
     min_observations: int = Field(40, ge=0, description="tau_obs, times a child must have been drawn (not scaled).")
     levels: int = Field(3, ge=1, le=6, description="Cell sizes 4^(levels-1) v ... v.")
     newborn_opacity: float | None = Field(
-        0.05,
+        None,
         gt=0.004,
         lt=0.99,
-        description="Opacity score of a new anchor's brightest child; null inherits the parent's.",
+        description="Opacity score that a new anchor's brightest child starts with; null inherits the parent's.",
     )
     max_anchors: int = Field(12_000, ge=16, description="Hard budget of anchors; the largest gradients win.")
     prune_from: int = Field(24_600, ge=0, description="First pruning: 80 % of the joint phase.")

@@ -34,8 +34,7 @@ from graings.machine import machine_facts, version_facts
 from graings.metrics import Lpips, SplitMetrics
 from graings.plan import Plan, make_plan
 from graings.render import render
-from graings.report import config_hash, curve_svg, write_metrics, write_text
-from graings.training.trainer import StepReport as TrainerReport
+from graings.report import config_hash, curve_svg, read_metrics, write_metrics, write_text
 from graings.training.trainer import Trainer
 
 SCHEMA = "graings.run/1"
@@ -158,6 +157,7 @@ class TrainingRun:
             run._clock = _Clock(dict(state.facts["seconds"]))
             run._curve = list(state.facts["curve"])
             run._events = list(state.facts["events"])
+            run._last_gaussians = int(state.facts["gaussians"])
         return run
 
     @property
@@ -176,6 +176,9 @@ class TrainingRun:
         return self.folder / "metrics.json"
 
     def __iter__(self) -> Iterator[StepReport]:
+        if self.iteration >= self.iterations and not self._is_complete():
+            # Interrupted between the last step and the last file: only the end is left to do.
+            self._finish()
         due = _evaluation_marks(self.config)
         rate = _Rate()
         for step in self._trainer:
@@ -184,11 +187,11 @@ class TrainingRun:
             rate.add(step.seconds)
             self._events += [{"iteration": step.iteration, "what": what} for what in step.events]
             last = step.iteration == self.iterations
-            point = self._evaluate(step) if step.iteration in due and not last else None
+            point = self._evaluate() if step.iteration in due and not last else None
             if step.iteration % self.config.evaluation.checkpoint_every == 0 and not last:
                 self.save()
             if last:
-                point = self._finish(step)
+                point = self._finish()
             yield StepReport(
                 iteration=step.iteration,
                 iterations=step.iterations,
@@ -212,7 +215,13 @@ class TrainingRun:
             scene=self._trainer.scene,
             state=TrainingState(
                 tensors,
-                {"trainer": facts, "seconds": self._clock.seconds, "curve": self._curve, "events": self._events},
+                {
+                    "trainer": facts,
+                    "seconds": self._clock.seconds,
+                    "curve": self._curve,
+                    "events": self._events,
+                    "gaussians": self._last_gaussians,
+                },
             ),
             units=self.capture.units,
             background=self.config.capture.background_rgb(),
@@ -228,7 +237,7 @@ class TrainingRun:
         """Views for the curve: never the test split."""
         return subset(self.capture.val, self.config.evaluation.views)
 
-    def _evaluate(self, step: TrainerReport) -> EvaluationPoint | None:
+    def _evaluate(self) -> EvaluationPoint | None:
         frames = self._held_out()
         if not frames:
             return None
@@ -236,24 +245,24 @@ class TrainingRun:
         metrics = evaluate(
             self._trainer.scene, frames, self.images, self.config.capture.background_rgb(), threads=self.threads
         )
-        point = self._point(step, metrics)
+        point = self._point(metrics)
         self._clock.add("evaluation", time.perf_counter() - started)
         self._write_metrics({})
         return point
 
-    def _point(self, step: TrainerReport, metrics: SplitMetrics) -> EvaluationPoint:
+    def _point(self, metrics: SplitMetrics) -> EvaluationPoint:
         if metrics.psnr is None or metrics.ssim_3dgs is None:
             raise ValueError("a point of the curve needs at least one view")
         rmse = math.sqrt(sum(view.mse for view in metrics.views) / len(metrics.views))
         point = EvaluationPoint(
-            iteration=step.iteration,
+            iteration=self.iteration,
             train_s=self._clock.train_s(),
             psnr=metrics.psnr,
             rmse=rmse,
             ssim_3dgs=metrics.ssim_3dgs,
             views=len(metrics.views),
-            gaussians=step.gaussians,
-            anchors=step.anchors,
+            gaussians=self._last_gaussians,
+            anchors=self._trainer.scene.scaffold.count,
         )
         self._curve.append(
             {
@@ -270,7 +279,7 @@ class TrainingRun:
         )
         return point
 
-    def _finish(self, step: TrainerReport) -> EvaluationPoint | None:
+    def _finish(self) -> EvaluationPoint | None:
         """Evaluate all of val, write the final checkpoint, metrics and curve."""
         point, splits = None, {}
         if self.capture.val:
@@ -278,13 +287,20 @@ class TrainingRun:
             background = self.config.capture.background_rgb()
             scene = self._trainer.scene
             curve = self._held_out()
-            point = self._point(step, evaluate(scene, curve, self.images, background, threads=self.threads))
+            point = self._point(evaluate(scene, curve, self.images, background, threads=self.threads))
             full = evaluate(scene, self.capture.val, self.images, background, lpips=Lpips.find(), threads=self.threads)
             splits["val"] = full.to_json()
             self._clock.add("evaluation", time.perf_counter() - started)
         self.save(finished=True)
         self._write_metrics(splits)
         return point
+
+    def _is_complete(self) -> bool:
+        """Whether the metrics document is that of the last iteration."""
+        if not self.metrics_path.exists():
+            return False
+        document = read_metrics(self.metrics_path)
+        return bool(document["iterations"] == self.iterations and (document["splits"] or not self.capture.val))
 
     def _write_run(self) -> None:
         document = {
