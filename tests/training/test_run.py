@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from graings.capture.synthetic import write_synthetic
 
+from graings.capture.synthetic import write_synthetic
 from graings.checkpoint import load_model, newest_checkpoint
 from graings.config import TrainConfig, make_config
 from graings.errors import CheckpointError
