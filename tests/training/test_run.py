@@ -60,7 +60,7 @@ def test_training_lowers_the_held_out_error_and_writes_everything(capture: Path,
     assert [report.iteration for report in reports] == list(range(1, 201))
     assert {report.phase for report in reports} == {"warmup", "joint"}
     points = [report.evaluation for report in reports if report.evaluation is not None]
-    assert points[-1].psnr > points[0].psnr + 1
+    assert points[-1].psnr > points[0].psnr + 3
     document = json.loads((tmp_path / "run" / "metrics.json").read_text(), parse_constant=_refuse)
     for key in KEYS:
         assert key in document, key
