@@ -6,6 +6,7 @@ decision, not this module's.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from graings.config import SceneConfig
-from graings.scene.canonical import identity_quaternion
+from graings.scene.canonical import INITIAL_SCALE, identity_quaternion
 from graings.scene.clip import clip
 from graings.scene.encoding import encoding_width, frequency_encoding
 
@@ -120,7 +121,7 @@ class SingleMLP(nn.Module):
             self.out.weight.mul_(0.1)
             self.out.weight[7:].zero_()
             self.out.bias.zero_()
-            self.out.bias[4:7] = -0.6931471805599453  # log 0.5, as in StaticMLP
+            self.out.bias[4:7] = math.log(INITIAL_SCALE)
 
     def forward(
         self, features: Tensor, offsets: Tensor, owners: Tensor, slots: Tensor, positions: Tensor, time: Tensor | None
