@@ -18,11 +18,12 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
+from graings import kernel
 from graings.camera import Camera
 from graings.gaussians import Gaussians
-from graings.raster.kernel import active_isa
 from graings.raster.rasterize import rasterize
 from graings.raster.ssim import ssim
+from graings.threads import use_threads
 
 
 def load_yardstick(folder: Path) -> ModuleType:
@@ -59,12 +60,12 @@ def main() -> None:
     parser.add_argument("--yardstick", type=Path, required=True)
     parser.add_argument("--gaussians", type=int, nargs="+", default=[10_000, 50_000])
     parser.add_argument("--size", type=int, nargs="+", default=[400])
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--threads", type=int, default=kernel.usable_cores())
     parser.add_argument("--rounds", type=int, default=15)
     options = parser.parse_args()
     yardstick = load_yardstick(options.yardstick)
-    torch.set_num_threads(options.threads)
-    print(f"{active_isa()}, {options.threads} threads, median (minimum) of {options.rounds} in ms")
+    use_threads(options.threads)
+    print(f"{kernel.active_isa()}, {options.threads} threads, median (minimum) of {options.rounds} in ms")
     print(f"{'scene':>12}  {'forward':>15}  {'forw.+backw.':>15}  {'SSIM + gradient':>15}")
     for count in options.gaussians:
         for size in options.size:

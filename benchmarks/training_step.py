@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from graings import kernel
 from graings.render import draw
 from graings.training import losses
 from graings.training.run import TrainingRun
@@ -50,7 +51,7 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     watch.lap("scene forward")
     gaussians = composition.gaussians
     offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-    result = draw(composition, frame.camera, trainer.background, means2d_offset=offset, threads=trainer.threads)
+    result = draw(composition, frame.camera, trainer.background, means2d_offset=offset)
     watch.lap("raster forward")
     image = result.color.detach().requires_grad_()
     losses.photometric(image, target, trainer.config.loss.ssim).backward()
@@ -97,7 +98,7 @@ def main() -> None:
     camera = run.capture.train[0].camera
     print(
         f"{camera.width}x{camera.height} px, iteration {trainer.iteration}, {statistics.median(counts):.0f} drawn, "
-        f"{trainer.scene.scaffold.count} anchors, {torch.get_num_threads()} threads, median of {arguments.steps} steps"
+        f"{trainer.scene.scaffold.count} anchors, {kernel.threads()} threads, median of {arguments.steps} steps"
     )
     total = 0.0
     for name, values in watch.parts.items():

@@ -32,6 +32,7 @@ from graings.interrupt import Interrupt
 from graings.progress import TrainingProgress
 from graings.render import render
 from graings.report import read_metrics
+from graings.threads import use_threads
 from graings.training.run import TrainingRun
 from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
 
@@ -151,6 +152,7 @@ def render_view(
     threads: Threads = None,
 ) -> None:
     """Draw one view at one time; without a camera, an orbit at the height of the training views."""
+    use_threads(threads)
     orbit = any(value is not None for value in (azimuth, elevation, radius, target, fov))
     if (camera is not None) + (pose is not None) + orbit > 1:
         raise typer.BadParameter("choose one of --camera, --pose and an orbit (--azimuth, --elevation, ...)")
@@ -175,7 +177,7 @@ def render_view(
     if t is not None and moment != t:
         _say(f"Time {t:g} lies outside the capture; drawn at {moment:g}.")
     started = time.perf_counter()
-    result = render(model.scene, view, moment, rgb or model.background, threads=threads)
+    result = render(model.scene, view, moment, rgb or model.background)
     milliseconds = 1e3 * (time.perf_counter() - started)
     output.write_bytes(encode_image(result.color.numpy(), format))
     _say(f"{output}: {view.width} x {view.height} at t = {moment:g}, drawn in {milliseconds:.0f} ms.")
@@ -189,7 +191,8 @@ def evaluate(
     threads: Threads = None,
 ) -> None:
     """Measure a trained model on held-out views and add the numbers to its metrics.json."""
-    _say_metrics(split, evaluate_run(run, split, capture, threads=threads).to_json())
+    use_threads(threads)
+    _say_metrics(split, evaluate_run(run, split, capture).to_json())
     _say(f"Written to {run / 'metrics.json'}.")
 
 

@@ -50,7 +50,6 @@ class SceneConfig(Part):
     feature_dim: int = Field(32, ge=1, le=256, description="Length of the anchor feature (d_f).")
     head_width: int = Field(32, ge=4, le=512, description="Hidden width of the colour, opacity and residual heads.")
     static_width: int = Field(64, ge=4, le=512, description="Hidden width of StaticMLP.")
-    child_code_dim: int = Field(8, ge=0, le=64, description="Learned code per child slot, input of StaticMLP.")
     deform_width: int = Field(64, ge=4, le=1024, description="Hidden width of DeformNet.")
     deform_depth: int = Field(4, ge=1, le=12, description="Hidden layers of DeformNet.")
     position_frequencies: int = Field(8, ge=0, le=16, description="Octaves of the position encoding in DeformNet.")

@@ -28,13 +28,12 @@ def evaluate(
     background: Sequence[float],
     *,
     lpips: Lpips | None = None,
-    threads: int | None = None,
 ) -> SplitMetrics:
     """Metrics of `scene` on `frames`: each view rendered at its own camera and time."""
 
     views = []
     for frame in frames:
-        rendered = render(scene, frame.camera, frame.time, background, threads=threads)
+        rendered = render(scene, frame.camera, frame.time, background)
         color = rendered.color.clamp(0, 1).numpy()
         views.append(measure(frame.name, frame.time, color, images.rgb(frame), lpips))
     return SplitMetrics.over(views, None if lpips is None else lpips.reason)
@@ -48,7 +47,7 @@ def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:
     return tuple(frames[i] for i in sorted(order[:size]))
 
 
-def evaluate_run(run: Path, split: str, capture: Path | None = None, *, threads: int | None = None) -> SplitMetrics:
+def evaluate_run(run: Path, split: str, capture: Path | None = None) -> SplitMetrics:
     """Evaluate the newest model of a run on one split and write the result into its `metrics.json`.
 
     The capture is found where it was at training time unless given. Raises `CheckpointError` when the run has
@@ -63,7 +62,7 @@ def evaluate_run(run: Path, split: str, capture: Path | None = None, *, threads:
         )
     frames = _split(data, split)
     images = ImageStore(model.background, model.config.capture.cache_mb)
-    metrics = evaluate(model.scene, frames, images, model.background, lpips=Lpips.find(), threads=threads)
+    metrics = evaluate(model.scene, frames, images, model.background, lpips=Lpips.find())
     document = read_metrics(run / "metrics.json")
     document["splits"][split] = metrics.to_json()
     write_metrics(run / "metrics.json", document)

@@ -15,24 +15,23 @@ import numpy as np
 import torch
 
 import graings
+from graings import kernel
 from graings.errors import KernelError
-from graings.raster.kernel import active_isa
 
 
 def machine_facts(threads: int | None = None) -> dict[str, Any]:
-    """Processor, memory, system and the threads of a run (None: all cores it may use)."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    """Processor, memory, system and the threads of a run (None: the kernel's default)."""
     return {
         "cpu": _cpu_model(),
         "cores": os.cpu_count(),
-        "usable_cores": usable,
+        "usable_cores": kernel.usable_cores(),
         "cpu_quota": _cpu_quota(),
         "ram_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
         "os": f"{platform.system()} {platform.release()}",
         "architecture": platform.machine(),
         "kernel_isa": _kernel_isa(),
         "torch_cpu_capability": torch.backends.cpu.get_cpu_capability(),
-        "threads": threads if threads is not None else torch.get_num_threads(),
+        "threads": threads if threads is not None else kernel.threads(),
     }
 
 
@@ -50,7 +49,7 @@ def version_facts() -> dict[str, Any]:
 def _kernel_isa() -> str | None:
     """Instruction set of the compiled kernel, or None where only the oracle can draw."""
     try:
-        return active_isa()
+        return kernel.active_isa()
     except KernelError:
         return None
 

@@ -25,11 +25,10 @@ def render(
     background: Sequence[float],
     *,
     settings: RasterSettings | None = None,
-    threads: int | None = None,
 ) -> RenderResult:
     """The scene at `time` in [0, 1] from `camera` on a `background` RGB in [0, 1], without gradients."""
     with torch.inference_mode():
-        return draw(scene.compose(camera.center, time), camera, background, settings=settings, threads=threads)
+        return draw(scene.compose(camera.center, time), camera, background, settings=settings)
 
 
 def draw(
@@ -39,7 +38,6 @@ def draw(
     *,
     means2d_offset: Float[Tensor, "gaussian 2"] | None = None,
     settings: RasterSettings | None = None,
-    threads: int | None = None,
 ) -> RenderResult:
     """Rasterize a composition; gradients flow to it and to `means2d_offset` (pixels, see `rasterize`)."""
     gaussians = composition.gaussians
@@ -49,5 +47,4 @@ def draw(
         torch.tensor(list(background), dtype=gaussians.means.dtype),
         means2d_offset=means2d_offset,
         settings=settings or RasterSettings(),
-        threads=threads,
     )

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
 import signal
 import sys
 from dataclasses import dataclass
@@ -16,10 +15,6 @@ from dataclasses import dataclass
 from jobs.store import JobFolder
 
 GRACE_S = 45.0  # loading a large capture or evaluating all held-out views cannot be interrupted
-
-# The service renders on the same cores. Threads that spin while they wait for one that was set aside cost everybody:
-# with one core taken by somebody else, training then runs several times slower than with threads that sleep.
-_POLITE = {"OMP_WAIT_POLICY": "PASSIVE"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +43,10 @@ class Trainer:
 
     async def run(self) -> Ending:
         """Start the child and wait for its end. When cancelled, has it write a checkpoint first."""
-        environment = {**_POLITE, **os.environ, "OMP_NUM_THREADS": str(self._threads)}
         with self._folder.log.open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "jobs.trainer_process", str(self._folder.path), "--threads", str(self._threads),
-                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=log, env=environment,
+                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=log,
                 # A Ctrl-C in the worker's terminal is the worker's to pass on.
                 start_new_session=True,
             )  # fmt: skip

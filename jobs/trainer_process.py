@@ -22,8 +22,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from graings.config import TrainConfig
 from graings.errors import DivergedError, GraingsError
 from graings.training.run import StepReport, TrainingRun
@@ -80,7 +78,6 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     spec = folder.spec()
     config = TrainConfig.model_validate(spec.config)
     threads = min(config.threads or threads, threads)
-    torch.set_num_threads(threads)
     capture = Store(folder.path.parent.parent).capture(spec.capture)
     checkpoint = folder.checkpoint()
     attempt = len(folder.attempts())

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-import torch
 from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
 import graings
+from graings.threads import use_threads
 from service import problems
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
@@ -25,7 +25,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        torch.set_num_threads(settings.render_threads)
+        use_threads(settings.render_threads)
         app.state.context = await to_thread.run_sync(open_context, settings)
         try:
             yield

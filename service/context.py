@@ -58,7 +58,7 @@ def open_context(settings: Settings) -> Context:
         jobs=jobs,
         leases=open_leases(settings.database_url, store.workers),
         scenes=Scenes(settings.models),
-        pool=RenderPool(settings.render_slots, settings.render_waiting, settings.render_threads),
+        pool=RenderPool(settings.render_slots, settings.render_waiting),
     )
 
 

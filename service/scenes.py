@@ -79,11 +79,10 @@ class Scenes:
 class RenderPool:
     """Draws images, `slots` at a time; at most `waiting` more may wait."""
 
-    def __init__(self, slots: int, waiting: int, threads: int) -> None:
+    def __init__(self, slots: int, waiting: int) -> None:
         self._limiter = CapacityLimiter(slots)
         self._most = slots + waiting
         self._inside = 0
-        self._threads = threads
 
     async def draw(self, model: Model, picture: Picture) -> bytes:
         """The encoded image. Raises `Busy`."""
@@ -96,7 +95,7 @@ class RenderPool:
             self._inside -= 1
 
     def _draw(self, model: Model, picture: Picture) -> bytes:
-        result = render(model.scene, picture.camera, picture.time, picture.background, threads=self._threads)
+        result = render(model.scene, picture.camera, picture.time, picture.background)
         return encode_image(np.asarray(result.color, dtype=np.float32), picture.format)
 
 

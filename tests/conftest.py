@@ -6,8 +6,21 @@ errors they give, which the hook would forestall.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
+import pytest
 from jaxtyping import install_import_hook
 
+from graings import kernel
 from tests import shapes
 
 install_import_hook(["graings.scene", "graings.training", "graings.render"], f"{shapes.__name__}.checked")
+
+
+@pytest.fixture(params=kernel.available_isas())
+def isa(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Every instruction set this CPU can run, one after the other."""
+    before = kernel.active_isa()
+    kernel.use_isa(request.param)
+    yield request.param
+    kernel.use_isa(before)

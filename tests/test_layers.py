@@ -17,6 +17,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings": (),
     # The ground: words that everyone shares.
     "graings.constants": (),
+    "graings.kernel": ("graings.errors",),
+    "graings.threads": ("graings.kernel",),
     "graings.errors": (),
     "graings.camera": (),
     "graings.gaussians": (),
@@ -24,14 +26,20 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.config": ("graings.errors",),
     # Three siblings, strangers to each other.
     "graings.capture": ("graings.capture", "graings.camera", "graings.units", "graings.config", "graings.errors"),
-    "graings.scene": ("graings.scene", "graings.camera", "graings.gaussians", "graings.config", "graings.constants"),
-    "graings.raster": ("graings.raster", "graings.camera", "graings.gaussians", "graings.constants", "graings.errors"),
+    "graings.scene": (
+        *("graings.scene", "graings.camera", "graings.gaussians", "graings.config", "graings.constants"),
+        "graings.kernel",
+    ),
+    "graings.raster": (
+        *("graings.raster", "graings.camera", "graings.gaussians", "graings.constants", "graings.errors"),
+        "graings.kernel",
+    ),
     # Scene and rasterizer meet here and nowhere else.
     "graings.render": ("graings.camera", "graings.raster", "graings.scene"),
     # What is done with a scene.
     "graings.viewpoint": ("graings.camera", "graings.units"),
     "graings.encode": (),
-    "graings.machine": ("graings", "graings.errors", "graings.raster.kernel"),
+    "graings.machine": ("graings", "graings.errors", "graings.kernel"),
     "graings.metrics": (),
     "graings.report": ("graings.errors",),
     "graings.plan": ("graings.capture.capture", "graings.config"),
@@ -47,7 +55,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.training", "graings.capture", "graings.scene", "graings.raster", "graings.render"),
         *("graings.camera", "graings.checkpoint", "graings.config", "graings.constants", "graings.errors"),
         *("graings.evaluation", "graings.machine", "graings.metrics", "graings.plan", "graings.report"),
-        *("graings.gaussians", "graings.units"),
+        *("graings.gaussians", "graings.units", "graings.threads"),
     ),
     # The terminal.
     "graings.progress": ("graings.training.run",),
@@ -55,7 +63,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.cli": (
         *("graings.camera", "graings.checkpoint", "graings.config", "graings.encode", "graings.errors"),
         *("graings.evaluation", "graings.interrupt", "graings.progress", "graings.render", "graings.report"),
-        *("graings.training.run", "graings.viewpoint"),
+        *("graings.threads", "graings.training.run", "graings.viewpoint"),
     ),
     "graings.__main__": ("graings.cli",),
     # Durable work knows the method by its options and its files; one child process knows how to train.
@@ -64,7 +72,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     # HTTP never trains.
     "service": (
         *("service", "jobs", "graings", "graings.camera", "graings.checkpoint", "graings.config", "graings.encode"),
-        *("graings.errors", "graings.render", "graings.units", "graings.viewpoint"),
+        *("graings.errors", "graings.render", "graings.threads", "graings.units", "graings.viewpoint"),
     ),
     "service.demo": ("service", "jobs", "graings.capture.synthetic", "graings.errors"),
 }

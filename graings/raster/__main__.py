@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from graings.raster.kernel import active_isa, available_isas
+from graings.kernel import active_isa, available_isas
 
 if __name__ == "__main__":
     print(f"{active_isa()} (available: {', '.join(available_isas())})")

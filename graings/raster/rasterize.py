@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from graings import kernel
 from graings.camera import Camera
 from graings.gaussians import Gaussians
 from graings.raster.arguments import check_arguments
-from graings.raster.kernel import kernel
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 
 
@@ -33,7 +33,7 @@ def rasterize(
 
     `means2d_offset` [N, 2] is added to the projected centres (pixels): pass zeros that require a gradient to
     learn the gradient in screen space. A Gaussian that is not drawn receives a gradient of exactly zero.
-    `threads` is the number of CPU threads (None: those of torch); the result has the same bits for any number.
+    `threads` is the number of CPU threads (None: the kernel's default); the result has the same bits for any number.
     Pixels are computed in the dtype of the Gaussians, geometry always in float64.
 
     Raises `ValueError` for a wrong shape, dtype or device, `KernelError` when the kernel is not built.
@@ -48,7 +48,7 @@ def rasterize(
         background,
         means2d_offset,
     )
-    workers = torch.get_num_threads() if threads is None else threads
+    workers = kernel.threads() if threads is None else threads
     color, alpha, depth, means2d, radii, culled = _Rasterize.apply(*tensors, gaussians.uids, camera, settings, workers)  # type: ignore[no-untyped-call]
     return RenderResult(color, alpha, depth, means2d, radii, culled)
 
@@ -80,7 +80,7 @@ class _Rasterize(torch.autograd.Function):
         color = means.new_empty(height, width, 3)
         alpha, depth = means.new_empty(height, width), means.new_empty(height, width)
         means2d, radii = means.new_empty(n, 2), means.new_empty(n, 2)
-        module = kernel()
+        module = kernel.kernel()
         draw = module.draw_float if means.dtype == torch.float32 else module.draw_double
         frame = draw(
             *ready,

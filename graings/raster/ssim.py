@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from graings.raster.kernel import kernel
+from graings import kernel
 
 
 def ssim(image: Tensor, target: Tensor, *, threads: int | None = None) -> Tensor:
@@ -34,7 +34,7 @@ def ssim(image: Tensor, target: Tensor, *, threads: int | None = None) -> Tensor
         raise ValueError("target must not require a gradient: ssim is differentiable in its first image only")
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
-    workers = torch.get_num_threads() if threads is None else threads
+    workers = kernel.threads() if threads is None else threads
     value: Tensor = _Ssim.apply(image, target, workers)  # type: ignore[no-untyped-call]
     return value
 
@@ -44,7 +44,7 @@ class _Ssim(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, target: Tensor, threads: int) -> Tensor:
         first, second = image.detach().contiguous(), target.detach().contiguous()
         gradient = torch.empty_like(first) if ctx.needs_input_grad[0] else None
-        value = kernel().ssim(first, second, image.shape[0], image.shape[1], gradient, threads)
+        value = kernel.kernel().ssim(first, second, image.shape[0], image.shape[1], gradient, threads)
         if gradient is not None:
             ctx.save_for_backward(gradient)
         return image.new_tensor(value)

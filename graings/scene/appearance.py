@@ -11,10 +11,10 @@ import math
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from graings.config import SceneConfig
 from graings.scene.encoding import encoding_width, frequency_encoding
+from graings.scene.perceptron import perceptron, weights_and_biases
 
 
 class CanonicalAppearance(nn.Module):
@@ -41,7 +41,7 @@ class CanonicalAppearance(nn.Module):
         self, features: Float[Tensor, "anchor feature"], directions: Float[Tensor, "anchor 3"]
     ) -> Float[Tensor, "anchor child 3"]:
         """c_can of every child slot."""
-        raw: Tensor = self.color(torch.cat([features, directions], dim=-1))
+        raw = perceptron(torch.cat([features, directions], dim=-1), *weights_and_biases(self.color))
         return raw.sigmoid().unflatten(-1, (-1, 3))
 
     def opacity_logits(
@@ -49,8 +49,7 @@ class CanonicalAppearance(nn.Module):
     ) -> Float[Tensor, "anchor child"]:
         """F_o before the tanh, for every child slot."""
         inputs = torch.cat([features, directions], dim=-1) if self.opacity_view else features
-        raw: Tensor = self.opacity(inputs)
-        return raw
+        return perceptron(inputs, *weights_and_biases(self.opacity))
 
 
 class ResidualField(nn.Module):
@@ -71,6 +70,7 @@ class ResidualField(nn.Module):
     ) -> tuple[Float[Tensor, "anchor child 3"], Float[Tensor, "anchor child"]]:
         """(Delta c, Delta o) at `time` in [0, 1]."""
         moment = self.from_time(frequency_encoding(time, self.time_frequencies))
-        hidden = functional.relu(self.from_feature(features) + moment)
-        raw = self.scale * torch.tanh(self.out(hidden)).unflatten(-1, (-1, 4))
+        biases = [self.from_feature.bias + moment, self.out.bias]
+        change = perceptron(features, [self.from_feature.weight, self.out.weight], biases)
+        raw = self.scale * torch.tanh(change).unflatten(-1, (-1, 4))
         return raw[..., :3], raw[..., 3]

@@ -13,10 +13,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from graings.config import SceneConfig
+from graings.scene.perceptron import perceptron
 
 # A child starts with about half the spacing of its neighbours as standard deviation: they overlap, but
 # none hides the next (decision 12).
 INITIAL_SCALE = 0.5
+
+
+def one_hot(slots: Int64[Tensor, " drawn"], codes: Float[Tensor, "child width"]) -> Float[Tensor, "drawn child"]:
+    """A one in the column of each child's slot: what picks its code in a first layer."""
+    return torch.eye(len(codes), dtype=codes.dtype, device=codes.device).index_select(0, slots)
 
 
 def identity_quaternion(like: Tensor) -> Tensor:
@@ -27,9 +33,9 @@ def identity_quaternion(like: Tensor) -> Tensor:
 class StaticMLP(nn.Module):
     """(f_a, eps_j, e_j) -> (r_can, rho_can) for each child by itself, Eq. 5.
 
-    The first layer is linear in its inputs, so the anchor's share is computed once per anchor. `e_j` is a
-    learned code per child slot shared by all anchors (decision 1): the children of a new anchor have zero
-    offsets and would otherwise be identical for ever. rho_can is relative to log s_a.
+    `e_j` is a learned code per child slot shared by all anchors (decision 1), here directly its share of the
+    first layer: the children of a new anchor have zero offsets and would otherwise be identical for ever.
+    rho_can is relative to log s_a.
     """
 
     def __init__(self, config: SceneConfig) -> None:
@@ -52,9 +58,10 @@ class StaticMLP(nn.Module):
         slots: Int64[Tensor, " drawn"],
     ) -> tuple[Float[Tensor, "drawn 4"], Float[Tensor, "drawn 3"]]:
         """Unit quaternions (w, x, y, z) and log-scales relative to log s_a of the drawn children."""
-        hidden = self.from_feature(features).index_select(0, owners) + self.from_offset(offsets)
-        hidden = functional.relu(hidden + self.child_bias.index_select(0, slots))
-        return canonical_attributes(self.out(hidden))
+        first = torch.cat([self.from_feature.weight, self.from_offset.weight, self.child_bias.t()], dim=1)
+        inputs = torch.cat([features.index_select(0, owners), offsets, one_hot(slots, self.child_bias)], dim=1)
+        raw = perceptron(inputs, [first, self.out.weight], [self.from_feature.bias, self.out.bias])
+        return canonical_attributes(raw)
 
 
 def canonical_attributes(raw: Float[Tensor, "drawn 7"]) -> tuple[Float[Tensor, "drawn 4"], Float[Tensor, "drawn 3"]]:

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from graings.config import SceneConfig
-from graings.scene.canonical import INITIAL_SCALE, identity_quaternion
+from graings.scene.canonical import INITIAL_SCALE, identity_quaternion, one_hot
 from graings.scene.clip import clip
 from graings.scene.encoding import encoding_width, frequency_encoding
+from graings.scene.perceptron import perceptron, weights_and_biases
 
 # Bound on the change of a log-scale in time (Eq. 10).
 LOG_SCALE_BOUND = 2.0
@@ -91,11 +91,8 @@ class DeformationNetwork(nn.Module):
         """`positions` in units of the scene's extent, `time` in [0, 1]."""
         encoded = frequency_encoding(positions, self.position_frequencies)
         bias = self.from_position.bias + self.from_time(frequency_encoding(time, self.time_frequencies))
-        hidden = functional.relu(functional.linear(encoded, self.from_position.weight, bias))
-        for layer in self.hidden:
-            hidden = functional.relu(layer(hidden))
-        raw: Tensor = self.out(hidden)
-        return raw
+        rest = weights_and_biases([*self.hidden, self.out])
+        return perceptron(encoded, [self.from_position.weight, *rest[0]], [bias, *rest[1]])
 
 
 class SingleMLP(nn.Module):
@@ -127,13 +124,15 @@ class SingleMLP(nn.Module):
         self, features: Tensor, offsets: Tensor, owners: Tensor, slots: Tensor, positions: Tensor, time: Tensor | None
     ) -> Float[Tensor, "gaussian 17"]:
         """Raw outputs of the drawn children; arguments as in StaticMLP and DeformationNetwork."""
-        hidden = self.from_feature(features).index_select(0, owners) + self.from_offset(offsets)
-        hidden = hidden + self.child_bias.index_select(0, slots)
-        hidden = hidden + self.from_position(frequency_encoding(positions, self.position_frequencies))
+        weights = [self.from_feature.weight, self.from_offset.weight, self.child_bias.t(), self.from_position.weight]
+        inputs = [
+            features.index_select(0, owners),
+            offsets,
+            one_hot(slots, self.child_bias),
+            frequency_encoding(positions, self.position_frequencies),
+        ]
+        bias = self.from_feature.bias
         if time is not None:
-            hidden = hidden + self.from_time(frequency_encoding(time, self.time_frequencies))
-        hidden = functional.relu(hidden)
-        for layer in self.hidden:
-            hidden = functional.relu(layer(hidden))
-        raw: Tensor = self.out(hidden)
-        return raw
+            bias = bias + self.from_time(frequency_encoding(time, self.time_frequencies))
+        rest = weights_and_biases([*self.hidden, self.out])
+        return perceptron(torch.cat(inputs, dim=1), [torch.cat(weights, dim=1), *rest[0]], [bias, *rest[1]])

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from graings.capture.capture import SPLITS, Capture, Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
@@ -35,6 +33,7 @@ from graings.metrics import Lpips, SplitMetrics
 from graings.plan import Plan, make_plan
 from graings.render import render
 from graings.report import config_hash, curve_svg, read_metrics, write_metrics, write_text
+from graings.threads import use_threads
 from graings.training.trainer import Trainer
 
 SCHEMA = "graings.run/1"
@@ -101,15 +100,13 @@ class TrainingRun:
         self.folder = folder
         self.capture = capture
         self.config = config
-        self.threads = threads if threads is not None else config.threads
-        if self.threads is not None:
-            torch.set_num_threads(self.threads)
+        self.threads = use_threads(threads if threads is not None else config.threads)
         self.plan: Plan = make_plan(capture, config)
         self.applied = self.plan.apply(config)
         self.images = ImageStore(config.capture.background_rgb(), config.capture.cache_mb)
         self._clock = clock
         started = time.perf_counter()
-        self._trainer = Trainer(capture, self.images, self.applied, threads=self.threads)
+        self._trainer = Trainer(capture, self.images, self.applied)
         clock.add("init", time.perf_counter() - started)
         self._curve: list[dict[str, Any]] = []
         self._events: list[dict[str, Any]] = []
@@ -242,9 +239,7 @@ class TrainingRun:
         if not frames:
             return None
         started = time.perf_counter()
-        metrics = evaluate(
-            self._trainer.scene, frames, self.images, self.config.capture.background_rgb(), threads=self.threads
-        )
+        metrics = evaluate(self._trainer.scene, frames, self.images, self.config.capture.background_rgb())
         point = self._point(metrics)
         self._clock.add("evaluation", time.perf_counter() - started)
         self._write_metrics({})
@@ -287,8 +282,8 @@ class TrainingRun:
             background = self.config.capture.background_rgb()
             scene = self._trainer.scene
             curve = self._held_out()
-            point = self._point(evaluate(scene, curve, self.images, background, threads=self.threads))
-            full = evaluate(scene, self.capture.val, self.images, background, lpips=Lpips.find(), threads=self.threads)
+            point = self._point(evaluate(scene, curve, self.images, background))
+            full = evaluate(scene, self.capture.val, self.images, background, lpips=Lpips.find())
             splits["val"] = full.to_json()
             self._clock.add("evaluation", time.perf_counter() - started)
         self.save(finished=True)
@@ -357,7 +352,7 @@ class TrainingRun:
         seconds = []
         for frame in (frames[0], *frames):
             started = time.perf_counter()
-            render(self._trainer.scene, frame.camera, frame.time, background, threads=self.threads)
+            render(self._trainer.scene, frame.camera, frame.time, background)
             seconds.append(time.perf_counter() - started)
         measured = sorted(seconds[1:])
         return 1.0 / max(measured[len(measured) // 2], 1e-9)

@@ -69,13 +69,10 @@ class StepReport:
 class Trainer:
     """Optimises a scene on a capture. Iterating trains one step at a time from `iteration` on."""
 
-    def __init__(
-        self, capture: Capture, images: ImageStore, config: TrainConfig, *, threads: int | None = None
-    ) -> None:
+    def __init__(self, capture: Capture, images: ImageStore, config: TrainConfig) -> None:
         self.capture = capture
         self.images = images
         self.config = config
-        self.threads = threads
         self.background = config.capture.background_rgb()
         self.phases = phases(config)
         self.streams = Streams(config.seed)
@@ -112,7 +109,7 @@ class Trainer:
 
         composition = self.scene.compose(frame.camera.center, frame.time)
         offset = torch.zeros(len(composition.gaussians), 2, requires_grad=True)
-        result = draw(composition, frame.camera, self.background, means2d_offset=offset, threads=self.threads)
+        result = draw(composition, frame.camera, self.background, means2d_offset=offset)
         image_loss = losses.photometric(result.color, target, self.config.loss.ssim)
         loss = image_loss + self._regularisers(composition, frame)
         # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.

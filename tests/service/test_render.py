@@ -35,7 +35,7 @@ def test_a_view_of_the_capture_is_what_the_library_renders(client: TestClient, m
     assert answer.status_code == 200
     loaded = load_model(trained)
     camera = loaded.views["val"][1].camera
-    expected = render(loaded.scene, camera, 0.37, loaded.background, threads=1)
+    expected = render(loaded.scene, camera, 0.37, loaded.background)
     assert answer.content == encode_image(expected.color.numpy(), "png")
     assert answer.headers["x-graings-job"] == model
     assert answer.headers["x-graings-iteration"] == str(ITERATIONS)
@@ -46,7 +46,7 @@ def test_an_orbit_takes_what_is_not_said_from_the_capture(client: TestClient, mo
     answer = client.get("/render", params={"azimuth": 40})
     loaded = load_model(trained)
     camera = orbit_view(loaded.views["train"], loaded.units, 40.0)
-    expected = render(loaded.scene, camera, 0.0, loaded.background, threads=1)
+    expected = render(loaded.scene, camera, 0.0, loaded.background)
     assert answer.content == encode_image(expected.color.numpy(), "png")
     azimuth, elevation, radius = map(float, answer.headers["x-graings-orbit"].split())
     again = client.get("/render", params={"azimuth": azimuth, "elevation": elevation, "radius": radius})
@@ -209,7 +209,7 @@ def test_a_model_is_loaded_once_until_its_checkpoint_changes(trained: Path, tmp_
 
 
 def test_who_finds_too_many_waiting_is_turned_away_at_once(trained: Path) -> None:
-    pool = RenderPool(slots=1, waiting=1, threads=1)
+    pool = RenderPool(slots=1, waiting=1)
     model = load_model(trained)
     camera = Camera.orbit(0.0, 0.0, 3.0, fov=0.7, width=8, height=8)
     picture = Picture(camera, 0.0, (1.0, 1.0, 1.0), "png")

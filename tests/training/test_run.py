@@ -75,6 +75,13 @@ def _refuse(constant: str) -> float:
     raise AssertionError(f"{constant} is not strict JSON")
 
 
+def test_any_number_of_threads_trains_the_same_model(capture: Path, tmp_path: Path) -> None:
+    for threads in (1, 3):
+        list(TrainingRun.create(capture, tmp_path / str(threads), _config(threads=threads)))
+    one, many = _tensors(tmp_path / "1"), _tensors(tmp_path / "3")
+    assert all(torch.equal(one[name], many[name]) for name in one)
+
+
 def test_a_run_resumed_from_any_checkpoint_equals_the_unbroken_run_bit_for_bit(capture: Path, tmp_path: Path) -> None:
     unbroken = TrainingRun.create(capture, tmp_path / "unbroken", _config())
     events = [event for report in unbroken for event in report.events]
@@ -160,7 +167,7 @@ def test_a_damaged_checkpoint_is_named(capture: Path, tmp_path: Path) -> None:
 
 def test_test_split_is_measured_only_when_asked(capture: Path, tmp_path: Path) -> None:
     list(TrainingRun.create(capture, tmp_path / "run", _config()))
-    metrics = evaluate_run(tmp_path / "run", "test", threads=1)
+    metrics = evaluate_run(tmp_path / "run", "test")
     document = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert document["splits"]["test"]["psnr"] == metrics.psnr
     assert set(document["splits"]) == {"val", "test"}

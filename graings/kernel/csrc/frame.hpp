@@ -1,25 +1,10 @@
 // One drawn view: runs the stages of the forward pass and keeps what the gradient needs.
 #pragma once
-#include <cstdlib>
-#include <memory>
 #include <vector>
+#include "buffer.hpp"
 #include "types.hpp"
 
 namespace graings {
-
-// An array without initialisation, aligned to a cache line.
-template <class T>
-class Buffer {
-public:
-    Buffer() = default;
-    explicit Buffer(size_t count);
-    T* get() const { return data_.get(); }
-    T& operator[](size_t i) const { return data_.get()[i]; }
-
-private:
-    struct Free { void operator()(void* p) const { std::free(p); } };
-    std::unique_ptr<T, Free> data_;
-};
 
 template <class R>
 struct Outputs {

@@ -4,7 +4,6 @@
 #include <bit>
 #include <cmath>
 #include <limits>
-#include <new>
 #include <numeric>
 #include <stdexcept>
 #include <tuple>
@@ -14,13 +13,6 @@
 #include "pool.hpp"
 
 namespace graings {
-
-template <class T>
-Buffer<T>::Buffer(size_t count) {
-    const size_t bytes = (std::max<size_t>(count, 1) * sizeof(T) + 63) / 64 * 64;
-    data_.reset(static_cast<T*>(std::aligned_alloc(64, bytes)));
-    if (!data_) throw std::bad_alloc();
-}
 
 namespace {
 

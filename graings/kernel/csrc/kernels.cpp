@@ -1,6 +1,7 @@
 // Compiled once per instruction set (CMakeLists.txt defines GRAINGS_ISA and the flags).
 #include <type_traits>
 #include "geometry.hpp"
+#include "perceptron.hpp"
 #include "ssim.hpp"
 #include "tiles.hpp"
 
@@ -9,7 +10,7 @@ namespace graings {
 namespace GRAINGS_ISA {
 template <class R>
 constexpr Kernels<R> table() {
-    return {project<R>, draw_tile<R>, tile_gradient<R>, geometry_gradient<R>, ssim_values<R>, ssim_gradient<R>};
+    return {project<R>, draw_tile<R>, tile_gradient<R>, geometry_gradient<R>, ssim_values<R>, ssim_gradient<R>, network_values<R>, network_gradient<R>};
 }
 extern const Kernels<float> single_precision;
 extern const Kernels<double> double_precision;

@@ -9,9 +9,13 @@
 #include <optional>
 #include <stdexcept>
 #include <string>
+#ifdef __GLIBC__
+#include <malloc.h>
+#endif
 
 #include "frame.hpp"
 #include "isa.hpp"
+#include "network.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -39,6 +43,22 @@ graings::Inputs<R> inputs(const In<R>& means, const In<R>& quats, const In<R>& l
     return {int64_t(n), checked(means, 3 * n, "means"), checked(quats, 4 * n, "quats"), checked(log_scales, 3 * n, "log_scales"),
             opacities.data(), checked(colors, 3 * n, "colors"), checked(offset, 2 * n, "means2d_offset"),
             checked(background, 3, "background")};
+}
+
+template <class R>
+graings::Network<R> network(const In<R>& input, int64_t rows, const std::vector<In<R>>& weights, const std::vector<In<R>>& biases) {
+    if (weights.empty() || weights.size() > graings::kMaxLayers || biases.size() != weights.size())
+        throw std::invalid_argument("a network has 1 to " + std::to_string(graings::kMaxLayers) + " layers, each with a weight and a bias");
+    graings::Network<R> result;
+    result.widths.push_back(int64_t(weights[0].shape(1)));
+    for (size_t l = 0; l < weights.size(); l++) {
+        const size_t out = weights[l].shape(0);
+        result.weights.push_back(checked(weights[l], out * size_t(result.widths.back()), "weight"));
+        result.biases.push_back(checked(biases[l], out, "bias"));
+        result.widths.push_back(int64_t(out));
+    }
+    checked(input, size_t(rows * result.widths[0]), "input");
+    return result;
 }
 
 template <class R>
@@ -86,6 +106,30 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
               return new Frame<R>(camera, settings, in, ties, out, threads);
           },
           nb::rv_policy::take_ownership);
+    m.def("network", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, Out<R> output, std::optional<Out<R>> hidden, int threads) {
+        const int64_t rows = int64_t(input.shape(0));
+        const auto layers = network<R>(input, rows, weights, biases);
+        R* out = checked(output, size_t(rows * layers.widths.back()), "output");
+        R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows)), "hidden");
+        nb::gil_scoped_release release;
+        graings::evaluate<R>(layers, rows, input.data(), out, kept, threads);
+    });
+    m.def("network_gradient", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, Out<R> hidden, In<R> v_output, std::optional<Out<R>> v_input,
+                                 std::vector<Out<R>> v_weights, std::vector<Out<R>> v_biases, int threads) {
+        const int64_t rows = int64_t(input.shape(0));
+        const auto layers = network<R>(input, rows, weights, biases);
+        const R* upstream = checked(v_output, size_t(rows * layers.widths.back()), "v_output");
+        R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows)), "hidden");
+        R* v_in = checked(v_input, input.size(), "v_input");
+        if (v_weights.size() != weights.size() || v_biases.size() != weights.size()) throw std::invalid_argument("one gradient per weight and bias");
+        std::vector<R*> w, b;
+        for (size_t l = 0; l < weights.size(); l++) {
+            w.push_back(checked(v_weights[l], weights[l].size(), "weight gradient"));
+            b.push_back(checked(v_biases[l], biases[l].size(), "bias gradient"));
+        }
+        nb::gil_scoped_release release;
+        graings::differentiate<R>(layers, rows, input.data(), kept, upstream, v_in, w, b, threads);
+    });
     m.def("ssim", [](In<R> image, In<R> target, int64_t height, int64_t width, std::optional<Out<R>> gradient, int threads) {
         const size_t size = size_t(3 * height * width);
         const R *first = checked(image, size, "image"), *second = checked(target, size, "target");
@@ -102,6 +146,13 @@ NB_MODULE(_kernel, m) {
     m.doc() = "Compiled rasterizer; use graings.raster.rasterize and graings.raster.ssim.";
     bind<float>(m, "FrameFloat", "draw_float");
     bind<double>(m, "FrameDouble", "draw_double");
+    m.def("hidden_size", &graings::hidden_size, "widths"_a, "rows"_a, "Elements that a network's hidden activations take.");
+    m.def("keep_freed_memory", [] {
+#ifdef __GLIBC__
+        mallopt(M_MMAP_THRESHOLD, 32 << 20);  // the most it accepts
+        mallopt(M_TRIM_THRESHOLD, 1 << 30);
+#endif
+    });
     m.def("available_isas", &graings::available_isas, "Instruction sets this CPU can run, best first.");
     m.def("active_isa", &graings::active_isa, "The instruction set in use.");
     m.def("use_isa", &graings::use_isa, "name"_a, "Choose an instruction set for the whole process.");

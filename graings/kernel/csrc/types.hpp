@@ -118,6 +118,25 @@ struct SsimArgs {
     double scale;   // 1 / (pixels * channels)
 };
 
+constexpr int kMaxLayers = 16;
+constexpr int64_t kNetworkRows = 64;  // rows at a time: their activations fit the second level of cache
+constexpr int64_t kNetworkPad = 16;   // widths are padded to a multiple of this
+
+// A network packed for the loops. Level 0 is the input, level `layers` the output.
+template <class R>
+struct NetworkArgs {
+    int layers;
+    int64_t widths[kMaxLayers + 1], padded[kMaxLayers + 1], widest;
+    int64_t offsets[kMaxLayers + 2];  // of each level's activations in the scratch, then of two gradients
+    int64_t weight_at[kMaxLayers], bias_at[kMaxLayers];  // in a set of partial sums
+    const R* forward[kMaxLayers];   // [in, out]
+    const R* backward[kMaxLayers];  // [out, in]; of the gradient only
+    const R* biases[kMaxLayers];
+    const R *input, *v_output;
+    R *output, *v_input;  // v_input may be null
+    R* hidden;            // the hidden levels of every block, kept for the gradient; null where none is wanted
+};
+
 // The functions compiled once per instruction set.
 template <class R>
 struct Kernels {
@@ -127,6 +146,8 @@ struct Kernels {
     void (*geometry_gradient)(const GeometryGradientArgs<R>&, int64_t begin, int64_t end);
     void (*ssim_values)(const SsimArgs<R>&, int64_t band, int64_t begin, int64_t end, R* scratch);
     void (*ssim_gradient)(const SsimArgs<R>&, int64_t begin, int64_t end, R* scratch);
+    void (*network_values)(const NetworkArgs<R>&, int64_t begin, int64_t end, R* scratch);
+    void (*network_gradient)(const NetworkArgs<R>&, int64_t begin, int64_t end, R* sums, R* scratch);
 };
 
 constexpr int kChunk = 32;  // entries of a tile prepared at a time in the forward pass

@@ -1,0 +1,108 @@
+#include "network.hpp"
+
+#include <algorithm>
+#include <stdexcept>
+
+#include "buffer.hpp"
+#include "isa.hpp"
+#include "pool.hpp"
+
+namespace graings {
+namespace {
+
+// Rows per piece of work and per set of partial sums: fixed, so that sums do not depend on the threads.
+constexpr int64_t kPieceRows = 8 * kNetworkRows;
+
+int64_t up(int64_t n, int64_t step) { return (n + step - 1) / step * step; }
+
+// The weights as the loops want them, in both directions, with zeros in the padding.
+template <class R>
+struct Packed {
+    NetworkArgs<R> args{};
+    int64_t scratch = 0, sums = 0;  // elements
+    Buffer<R> numbers;
+
+    Packed(const Network<R>& network, const R* input, R* hidden, bool gradient) {
+        args.layers = int(network.weights.size());
+        args.input = input, args.hidden = hidden;
+        int64_t size = 0;
+        for (int l = 0; l <= args.layers; l++) {
+            args.widths[l] = network.widths[size_t(l)], args.padded[l] = up(args.widths[l], kNetworkPad);
+            args.widest = std::max(args.widest, args.padded[l]);
+            args.offsets[l] = scratch, scratch += args.padded[l] * kNetworkRows;
+        }
+        args.offsets[args.layers + 1] = scratch;
+        if (gradient) scratch += 2 * args.widest * kNetworkRows;
+        for (int l = 0; l < args.layers; l++) {
+            const int64_t weight = args.padded[l] * args.padded[l + 1];
+            args.weight_at[l] = sums, args.bias_at[l] = sums + weight, sums += weight + args.padded[l + 1];
+            size += (gradient ? 2 : 1) * weight + args.padded[l + 1];
+        }
+        numbers = Buffer<R>(size_t(size));
+        std::fill_n(numbers.get(), size, R(0));
+        R* at = numbers.get();
+        for (int l = 0; l < args.layers; l++) {
+            const int64_t in = args.padded[l], out = args.padded[l + 1], ins = args.widths[l], outs = args.widths[l + 1];
+            const R* weight = network.weights[size_t(l)];
+            R *forward = at, *bias = at + in * out, *backward = bias + out;
+            for (int64_t o = 0; o < outs; o++)
+                for (int64_t i = 0; i < ins; i++) {
+                    forward[i * out + o] = weight[o * ins + i];
+                    if (gradient) backward[o * in + i] = weight[o * ins + i];
+                }
+            std::copy_n(network.biases[size_t(l)], outs, bias);
+            args.forward[l] = forward, args.biases[l] = bias, args.backward[l] = backward;
+            at += (gradient ? 2 : 1) * in * out + out;
+        }
+    }
+};
+
+}  // namespace
+
+int64_t hidden_size(const std::vector<int64_t>& widths, int64_t rows) {
+    int64_t row = 0;
+    for (size_t l = 1; l + 1 < widths.size(); l++) row += up(widths[l], kNetworkPad);
+    return row * up(rows, kNetworkRows);
+}
+
+template <class R>
+void evaluate(const Network<R>& network, int64_t rows, const R* input, R* output, R* hidden, int threads) {
+    Packed<R> packed(network, input, hidden, false);
+    packed.args.output = output;
+    const int64_t pieces = up(rows, kPieceRows) / kPieceRows;
+    Buffer<R> scratch(size_t(threads) * size_t(packed.scratch));
+    parallel_for(threads, pieces, [&](int worker, int64_t piece) {
+        kernels<R>().network_values(packed.args, piece * kPieceRows, std::min(rows, (piece + 1) * kPieceRows), scratch.get() + worker * packed.scratch);
+    });
+}
+
+template <class R>
+void differentiate(const Network<R>& network, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, int threads) {
+    Packed<R> packed(network, input, hidden, true);
+    NetworkArgs<R>& args = packed.args;
+    args.v_output = v_output, args.v_input = v_input;
+    const int64_t pieces = up(rows, kPieceRows) / kPieceRows;
+    Buffer<R> scratch(size_t(threads) * size_t(packed.scratch)), sums(size_t(std::max<int64_t>(pieces, 1)) * size_t(packed.sums));
+    std::fill_n(sums.get(), packed.sums, R(0));
+    parallel_for(threads, pieces, [&](int worker, int64_t piece) {
+        R* own = sums.get() + piece * packed.sums;
+        std::fill_n(own, packed.sums, R(0));
+        kernels<R>().network_gradient(args, piece * kPieceRows, std::min(rows, (piece + 1) * kPieceRows), own, scratch.get() + worker * packed.scratch);
+    });
+    for (int64_t piece = 1; piece < pieces; piece++)
+        for (int64_t i = 0; i < packed.sums; i++) sums[size_t(i)] += sums[size_t(piece * packed.sums + i)];
+    for (int l = 0; l < args.layers; l++) {
+        const int64_t ins = args.widths[l], outs = args.widths[l + 1];
+        for (int64_t o = 0; o < outs; o++) std::copy_n(sums.get() + args.weight_at[l] + o * args.padded[l], ins, v_weights[size_t(l)] + o * ins);
+        std::copy_n(sums.get() + args.bias_at[l], outs, v_biases[size_t(l)]);
+    }
+}
+
+#define GRAINGS_INSTANTIATE(R)                                                              \
+    template void evaluate<R>(const Network<R>&, int64_t, const R*, R*, R*, int);           \
+    template void differentiate<R>(const Network<R>&, int64_t, const R*, R*, const R*, R*, const std::vector<R*>&, const std::vector<R*>&, int);
+GRAINGS_INSTANTIATE(float)
+GRAINGS_INSTANTIATE(double)
+#undef GRAINGS_INSTANTIATE
+
+}  // namespace graings

@@ -1,0 +1,27 @@
+// A network over many rows: layout of its scratch, packing of its weights, and the split into pieces.
+#pragma once
+#include <vector>
+#include "types.hpp"
+
+namespace graings {
+
+// `widths` has one entry per level, input first; weights[l] is [widths[l + 1], widths[l]] row by row. ReLU
+// between layers, none after the last.
+template <class R>
+struct Network {
+    std::vector<int64_t> widths;
+    std::vector<const R*> weights, biases;
+};
+
+// Elements that the hidden activations of so many rows take.
+int64_t hidden_size(const std::vector<int64_t>& widths, int64_t rows);
+
+// output [rows, widths.back()] of input [rows, widths.front()]. `hidden` may be null when no gradient is wanted.
+template <class R>
+void evaluate(const Network<R>&, int64_t rows, const R* input, R* output, R* hidden, int threads);
+
+// Gradients for `v_output`, with `hidden` as evaluate left it; `v_input` may be null. The same bits for any number of threads.
+template <class R>
+void differentiate(const Network<R>&, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, int threads);
+
+}  // namespace graings

@@ -1,0 +1,102 @@
+"""Perceptron: a chain of linear layers with ReLU between them, for many rows at once, in the compiled kernel.
+
+Torch runs such a chain one layer at a time and sends every activation through memory; the kernel takes a block
+of rows through all layers while they lie in cache. Knows nothing of what the rows are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+from graings import kernel
+
+
+def perceptron(
+    inputs: Float[Tensor, "row input"],
+    weights: Sequence[Float[Tensor, "_ _"]],
+    biases: Sequence[Float[Tensor, " _"]],
+    *,
+    threads: int | None = None,
+) -> Float[Tensor, "row output"]:
+    """W_n relu(... relu(W_1 x + b_1) ...) + b_n for each row x; weights are [out, in] as torch's.
+
+    Differentiable once in everything. `threads` is the number of CPU threads (None: the kernel's default); values and
+    gradients have the same bits for any number. Raises `ValueError` for a wrong shape, dtype or device.
+    """
+    width, kind = inputs.shape[-1], inputs.dtype
+    if inputs.ndim != 2 or kind not in (torch.float32, torch.float64):
+        raise ValueError(f"inputs must be [row, input] in float32 or float64, got {tuple(inputs.shape)} in {kind}")
+    if not weights or len(weights) != len(biases):
+        raise ValueError(f"every layer needs a weight and a bias, got {len(weights)} weights and {len(biases)} biases")
+    for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
+            raise ValueError(
+                f"layer {layer} takes {width} numbers: its weight must be [out, {width}] and its bias [out], "
+                f"got {tuple(weight.shape)} and {tuple(bias.shape)}"
+            )
+        width = weight.shape[0]
+    tensors = (inputs, *weights, *biases)
+    if any(t.dtype != kind or t.device.type != "cpu" for t in tensors):
+        raise ValueError(f"inputs, weights and biases must all be {kind} on the CPU")
+    workers = kernel.threads() if threads is None else threads
+    if workers < 1:
+        raise ValueError(f"threads must be at least 1, got {workers}")
+    values: Tensor = _Perceptron.apply(workers, *tensors)  # type: ignore[no-untyped-call]
+    return values
+
+
+def plain_perceptron(
+    inputs: Float[Tensor, "row input"],
+    weights: Sequence[Float[Tensor, "_ _"]],
+    biases: Sequence[Float[Tensor, " _"]],
+) -> Float[Tensor, "row output"]:
+    """The oracle of `perceptron`: the same chain as torch writes it, layer by layer."""
+    values = functional.linear(inputs, weights[0], biases[0])
+    for weight, bias in zip(weights[1:], biases[1:], strict=True):
+        values = functional.linear(functional.relu(values), weight, bias)
+    return values
+
+
+def weights_and_biases(layers: Iterable[nn.Module]) -> tuple[list[Tensor], list[Tensor]]:
+    """Of the linear layers among `layers`, in order."""
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    return [layer.weight for layer in linear], [layer.bias for layer in linear]
+
+
+class _Perceptron(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, threads: int, *tensors: Tensor) -> Tensor:
+        ready = [t.detach().contiguous() for t in tensors]
+        inputs, weights, biases = _parts(ready)
+        output = inputs.new_empty(len(inputs), len(biases[-1]))
+        hidden: Tensor | None = None
+        if any(ctx.needs_input_grad):
+            hidden = inputs.new_empty(kernel.kernel().hidden_size([inputs.shape[1], *map(len, biases)], len(inputs)))
+            ctx.save_for_backward(hidden, *ready)
+            ctx.threads = threads
+        kernel.kernel().network(inputs, weights, biases, output, hidden, threads)
+        return output
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        hidden, *ready = ctx.saved_tensors
+        inputs, weights, biases = _parts(ready)
+        v_inputs = torch.empty_like(inputs) if ctx.needs_input_grad[1] else None
+        v_weights, v_biases = [torch.empty_like(w) for w in weights], [torch.empty_like(b) for b in biases]
+        kernel.kernel().network_gradient(
+            inputs, weights, biases, hidden, upstream.contiguous(), v_inputs, v_weights, v_biases, ctx.threads
+        )
+        return None, v_inputs, *v_weights, *v_biases
+
+
+def _parts(tensors: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+    inputs, *rest = tensors
+    return inputs, rest[: len(rest) // 2], rest[len(rest) // 2 :]
