@@ -21,8 +21,8 @@ from torch import Tensor
 from graings import kernel
 from graings.camera import Camera
 from graings.gaussians import Gaussians
+from graings.raster.photometric import ssim
 from graings.raster.rasterize import rasterize
-from graings.raster.ssim import ssim
 from graings.threads import use_threads
 
 

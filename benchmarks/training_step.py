@@ -17,8 +17,8 @@ from pathlib import Path
 import torch
 
 from graings import kernel
+from graings.raster.photometric import photometric
 from graings.render import draw
-from graings.training import losses
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 
@@ -54,7 +54,7 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     result = draw(composition, frame.camera, trainer.background, means2d_offset=offset)
     watch.lap("raster forward")
     image = result.color.detach().requires_grad_()
-    losses.photometric(image, target, trainer.config.loss.ssim).backward()
+    photometric(image, target, trainer.config.loss.ssim).backward()
     watch.lap("photometric loss, forward + backward")
     leaves = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacities, gaussians.colors, offset]
     grads = torch.autograd.grad(result.color, leaves, image.grad)

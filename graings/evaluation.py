@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import statistics
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -45,6 +47,16 @@ def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:
         return tuple(frames)
     order = sorted(range(len(frames)), key=lambda i: hashlib.sha256(frames[i].name.encode()).digest())
     return tuple(frames[i] for i in sorted(order[:size]))
+
+
+def frames_per_second(scene: Scene, frames: Sequence[Frame], background: Sequence[float]) -> float:
+    """Median speed of rendering `frames` at their size after one to warm up, networks included."""
+    seconds = []
+    for frame in (frames[0], *frames):
+        started = time.perf_counter()
+        render(scene, frame.camera, frame.time, background)
+        seconds.append(time.perf_counter() - started)
+    return 1.0 / max(statistics.median(seconds[1:]), 1e-9)
 
 
 def evaluate_run(run: Path, split: str, capture: Path | None = None) -> SplitMetrics:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-from graings.training.run import EvaluationPoint, StepReport
+from graings.training.run import EvaluationPoint, RunReport
 
 
 class _TimeLeft(ProgressColumn):
@@ -61,7 +61,7 @@ class TrainingProgress:
     ) -> None:
         self._bar.stop()
 
-    def show(self, step: StepReport) -> None:
+    def show(self, step: RunReport) -> None:
         """Move the bar to `step`; evaluations and events stay on the screen as lines."""
         self._bar.update(
             self._task,

@@ -1,4 +1,4 @@
-"""Run folder: where the checkpoints of a run lie and which is the newest.
+"""Run folder: where the checkpoints of a run lie, which is the newest, and who may write them.
 
 Apart from `graings.checkpoint` so that those who only ask how far a run got need no tensors. Knows nothing of what is
 in a checkpoint.
@@ -6,8 +6,14 @@ in a checkpoint.
 
 from __future__ import annotations
 
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from graings.errors import CheckpointError
+
+LOCK_FILE = ".training"
 CHECKPOINTS = "checkpoints"
 FACTS_FILE = "checkpoint.json"
 
@@ -24,3 +30,14 @@ def newest_checkpoint(run: Path) -> Path | None:
     """The newest whole checkpoint of a run folder, or None."""
     found = checkpoints(run)
     return found[-1] if found else None
+
+
+@contextmanager
+def sole_trainer(run: Path) -> Iterator[None]:
+    """Holds a run folder for this trainer. Raises `CheckpointError` when another process of this machine does."""
+    with (run / LOCK_FILE).open("a") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise CheckpointError(f"{run}: is being trained by another process. Wait for it, or stop it.") from error
+        yield

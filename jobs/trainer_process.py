@@ -24,7 +24,7 @@ from typing import Any
 
 from graings.config import TrainConfig
 from graings.errors import DivergedError, GraingsError
-from graings.training.run import StepReport, TrainingRun
+from graings.training.run import RunReport, TrainingRun
 from jobs.exit_code import ExitCode
 from jobs.files import locked
 from jobs.parent import watch_parent
@@ -111,7 +111,7 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     return ExitCode.DONE
 
 
-def _values(report: StepReport) -> dict[str, Any]:
+def _values(report: RunReport) -> dict[str, Any]:
     speed = report.iterations_per_s
     return {
         "phase": report.phase,
@@ -127,7 +127,7 @@ def _values(report: StepReport) -> dict[str, Any]:
     }
 
 
-def _line(report: StepReport) -> str:
+def _line(report: RunReport) -> str:
     line = (
         f"{report.iteration}/{report.iterations} {report.phase}: loss {report.loss:.5f}, PSNR {report.psnr:.2f} dB, "
         f"{report.gaussians} Gaussians, {report.anchors} anchors, {report.iterations_per_s:.1f} it/s"

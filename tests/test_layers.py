@@ -43,7 +43,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.metrics": (),
     "graings.report": ("graings.errors",),
     "graings.plan": ("graings.capture.capture", "graings.config"),
-    "graings.run_folder": (),
+    "graings.run_folder": ("graings.errors",),
     "graings.checkpoint": (
         *("graings.camera", "graings.config", "graings.errors", "graings.run_folder", "graings.scene", "graings.units"),
     ),
@@ -55,7 +55,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.training", "graings.capture", "graings.scene", "graings.raster", "graings.render"),
         *("graings.camera", "graings.checkpoint", "graings.config", "graings.constants", "graings.errors"),
         *("graings.evaluation", "graings.machine", "graings.metrics", "graings.plan", "graings.report"),
-        *("graings.gaussians", "graings.units", "graings.threads"),
+        *("graings.gaussians", "graings.run_folder", "graings.units", "graings.threads"),
     ),
     # The terminal.
     "graings.progress": ("graings.training.run",),

@@ -25,14 +25,13 @@ class Guard:
 
     def passes(self, loss: Tensor, parameters: Iterable[tuple[str, nn.Parameter]]) -> bool:
         """Whether the step may be taken. Raises `DivergedError` after three bad steps in a row."""
+        grads = [(name, p.grad) for name, p in parameters if p.grad is not None and p.grad.numel() > 0]
         culprit = None if bool(torch.isfinite(loss)) else "the loss"
-        for name, parameter in parameters:
-            if culprit is not None:
-                break
-            # The largest magnitude is non-finite exactly when some entry is (NaN wins every comparison).
-            grad = parameter.grad
-            if grad is not None and grad.numel() > 0 and not bool(torch.isfinite(grad.abs().amax())):
-                culprit = f"the gradient of {name}"
+        # The largest magnitude is non-finite exactly when some entry is (NaN wins every comparison).
+        largest = torch._foreach_norm([grad for _, grad in grads], torch.inf) if grads else []
+        if culprit is None and largest and not bool(torch.stack(list(largest)).isfinite().all()):
+            bad = next(name for (name, _), size in zip(grads, largest, strict=True) if not size.isfinite())
+            culprit = f"the gradient of {bad}"
         if culprit is None:
             self.consecutive = 0
             return True

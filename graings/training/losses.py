@@ -1,6 +1,7 @@
-"""The loss terms as pure functions, each with its equation.
+"""The loss terms on the model itself as pure functions, each with its equation; `graings.raster.photometric` is that
+on the image.
 
-Reductions are means over pixels or Gaussians (decision 10): a sum would change the balance with every
+Reductions are means over Gaussians (decision 10): a sum would change the balance with every
 growth. Knows nothing of schedules or optimisers.
 """
 
@@ -9,18 +10,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor
 
-from graings.raster.ssim import ssim
 from graings.scene.deformation import Deformation
-
-
-def photometric(
-    image: Float[Tensor, "height width 3"], target: Float[Tensor, "height width 3"], ssim_weight: float
-) -> Tensor:
-    """(1 - w) |image - target|_1 + w (1 - SSIM), Eq. 15."""
-    absolute = (image - target).abs().mean()
-    if ssim_weight == 0:
-        return absolute
-    return (1.0 - ssim_weight) * absolute + ssim_weight * (1.0 - ssim(image, target))
 
 
 def temporal(

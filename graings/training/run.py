@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,22 +27,20 @@ from graings.checkpoint import (
 )
 from graings.config import TrainConfig
 from graings.errors import CheckpointError
-from graings.evaluation import evaluate, subset
+from graings.evaluation import evaluate, frames_per_second, subset
 from graings.machine import machine_facts, version_facts
 from graings.metrics import Lpips, SplitMetrics
 from graings.plan import Plan, make_plan
-from graings.render import render
 from graings.report import config_hash, curve_svg, read_metrics, write_metrics, write_text
+from graings.run_folder import sole_trainer
 from graings.threads import use_threads
-from graings.training.trainer import Trainer
+from graings.training.pace import Clock, Rate, evaluation_marks
+from graings.training.trainer import StepReport, Trainer
 
 SCHEMA = "graings.run/1"
 METRICS_SCHEMA = "graings.metrics/1"
 
-# The rate shown to the user is the mean over about this many recent seconds.
-RATE_WINDOW_S = 5.0
-
-# Frames per second are the median over this many views after one to warm up.
+# Frames per second are measured on this many views.
 FPS_VIEWS = 8
 
 
@@ -60,43 +58,19 @@ class EvaluationPoint:
     anchors: int
 
 
-@dataclass(frozen=True, slots=True)
-class StepReport:
-    """One step as a user wants to hear of it. `psnr` is of the training view just drawn, in dB."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunReport(StepReport):
+    """One step as a user wants to hear of it: with the pace of the run, and held-out quality where it was measured."""
 
-    iteration: int
-    iterations: int
-    phase: str
-    loss: float
-    psnr: float
-    gaussians: int
-    anchors: int
     iterations_per_s: float
     train_s: float
     evaluation: EvaluationPoint | None = None
-    events: tuple[str, ...] = ()
-
-
-@dataclass(slots=True)
-class _Clock:
-    """Seconds per phase; training, evaluation and saving never share a second."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def add(self, phase: str, seconds: float) -> None:
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + seconds
-
-    def train_s(self) -> float:
-        return sum(self.seconds.get(phase, 0.0) for phase in ("init", "warmup", "joint", "static"))
-
-    def total_s(self) -> float:
-        return sum(self.seconds.values())
 
 
 class TrainingRun:
     """One run folder being trained. Make it with `create` or `resume`."""
 
-    def __init__(self, folder: Path, capture: Capture, config: TrainConfig, threads: int | None, clock: _Clock) -> None:
+    def __init__(self, folder: Path, capture: Capture, config: TrainConfig, threads: int | None, clock: Clock) -> None:
         self.folder = folder
         self.capture = capture
         self.config = config
@@ -120,7 +94,7 @@ class TrainingRun:
         """
         if (folder / "run.json").exists():
             raise CheckpointError(f"{folder}: already holds a run. Resume it (--resume) or choose another folder.")
-        clock = _Clock()
+        clock = Clock()
         started = time.perf_counter()
         data = load_capture(capture, config.capture)
         clock.add("load", time.perf_counter() - started)
@@ -141,7 +115,7 @@ class TrainingRun:
         except (OSError, ValueError) as error:
             raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
         config = TrainConfig.model_validate(facts["config"])
-        clock = _Clock()
+        clock = Clock()
         started = time.perf_counter()
         data = load_capture(capture or Path(facts["capture"]["path"]), config.capture)
         if data.content_hash != facts["capture"]["hash"]:
@@ -151,7 +125,7 @@ class TrainingRun:
         if newest_checkpoint(folder) is not None:
             state = load_state(folder)
             run._trainer.load(load_model(folder).scene, state.tensors, state.facts["trainer"])
-            run._clock = _Clock(dict(state.facts["seconds"]))
+            run._clock = Clock(dict(state.facts["seconds"]))
             run._curve = list(state.facts["curve"])
             run._events = list(state.facts["events"])
             run._last_gaussians = int(state.facts["gaussians"])
@@ -172,12 +146,16 @@ class TrainingRun:
         """Where the metrics document is."""
         return self.folder / "metrics.json"
 
-    def __iter__(self) -> Iterator[StepReport]:
+    def __iter__(self) -> Iterator[RunReport]:
+        with sole_trainer(self.folder):
+            yield from self._train()
+
+    def _train(self) -> Iterator[RunReport]:
         if self.iteration >= self.iterations and not self._is_complete():
             # Interrupted between the last step and the last file: only the end is left to do.
             self._finish()
-        due = _evaluation_marks(self.config)
-        rate = _Rate()
+        due = evaluation_marks(self.config)
+        rate = Rate()
         for step in self._trainer:
             self._clock.add(step.phase, step.seconds)
             self._last_gaussians = step.gaussians
@@ -189,18 +167,11 @@ class TrainingRun:
                 self.save()
             if last:
                 point = self._finish()
-            yield StepReport(
-                iteration=step.iteration,
-                iterations=step.iterations,
-                phase=step.phase,
-                loss=step.loss,
-                psnr=step.psnr,
-                gaussians=step.gaussians,
-                anchors=step.anchors,
+            yield RunReport(
+                **{part.name: getattr(step, part.name) for part in fields(step)},
                 iterations_per_s=rate.per_second(),
                 train_s=self._clock.train_s(),
                 evaluation=point,
-                events=step.events,
             )
 
     def save(self, *, finished: bool = False) -> Path:
@@ -259,19 +230,7 @@ class TrainingRun:
             gaussians=self._last_gaussians,
             anchors=self._trainer.scene.scaffold.count,
         )
-        self._curve.append(
-            {
-                "iteration": point.iteration,
-                "train_s": point.train_s,
-                "total_s": self._clock.total_s(),
-                "psnr": point.psnr,
-                "rmse": point.rmse,
-                "ssim_3dgs": point.ssim_3dgs,
-                "views": point.views,
-                "gaussians": point.gaussians,
-                "anchors": point.anchors,
-            }
-        )
+        self._curve.append({**asdict(point), "total_s": self._clock.total_s()})
         return point
 
     def _finish(self) -> EvaluationPoint | None:
@@ -313,7 +272,7 @@ class TrainingRun:
         write_metrics(self.folder / "run.json", document)
 
     def _write_metrics(self, splits: dict[str, Any]) -> None:
-        scene = self._trainer.scene
+        scene, background = self._trainer.scene, self.config.capture.background_rgb()
         document = {
             "schema": METRICS_SCHEMA,
             "splits": splits,
@@ -324,7 +283,7 @@ class TrainingRun:
             "gaussians": self._last_gaussians,
             "anchors": scene.scaffold.count,
             "bytes": {"fp32": scene_bytes(scene), "compact": None},
-            "render_fps": self._frames_per_second(),
+            "render_fps": frames_per_second(scene, subset(self.capture.train, FPS_VIEWS), background),
             "curve": self._curve,
             "events": self._events,
             "plan": self.plan.to_json(),
@@ -333,7 +292,7 @@ class TrainingRun:
                 "times": len(self.capture.times),
                 "width": self.capture.train[0].camera.width,
                 "height": self.capture.train[0].camera.height,
-                "background": list(self.config.capture.background_rgb()),
+                "background": list(background),
                 "notes": list(self.capture.notes),
             },
             "skipped_steps": self._trainer.guard.skipped,
@@ -344,41 +303,3 @@ class TrainingRun:
         }
         write_metrics(self.metrics_path, document)
         write_text(self.folder / "curve.svg", curve_svg(self._curve))
-
-    def _frames_per_second(self) -> float:
-        """Median speed of rendering training views at training size, geometry networks included."""
-        frames = subset(self.capture.train, FPS_VIEWS)
-        background = self.config.capture.background_rgb()
-        seconds = []
-        for frame in (frames[0], *frames):
-            started = time.perf_counter()
-            render(self._trainer.scene, frame.camera, frame.time, background)
-            seconds.append(time.perf_counter() - started)
-        measured = sorted(seconds[1:])
-        return 1.0 / max(measured[len(measured) // 2], 1e-9)
-
-
-class _Rate:
-    """Iterations per second over the last few seconds."""
-
-    def __init__(self) -> None:
-        self._recent: list[float] = []
-        self._sum = 0.0
-
-    def add(self, seconds: float) -> None:
-        self._recent.append(seconds)
-        self._sum += seconds
-        while len(self._recent) > 1 and self._sum - self._recent[0] > RATE_WINDOW_S:
-            self._sum -= self._recent.pop(0)
-
-    def per_second(self) -> float:
-        return len(self._recent) / max(self._sum, 1e-9)
-
-
-def _evaluation_marks(config: TrainConfig) -> frozenset[int]:
-    """Iterations at which to evaluate: geometrically spaced."""
-    marks, mark = set(), float(config.evaluation.first)
-    while mark < config.iterations:
-        marks.add(round(mark))
-        mark *= config.evaluation.factor
-    return frozenset(marks)

@@ -17,6 +17,7 @@ from torch import Tensor
 from graings.capture.capture import Capture, Frame
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
+from graings.raster.photometric import photometric
 from graings.render import draw
 from graings.scene.scene import Composition, Scene
 from graings.training import density, losses
@@ -110,7 +111,7 @@ class Trainer:
         composition = self.scene.compose(frame.camera.center, frame.time)
         offset = torch.zeros(len(composition.gaussians), 2, requires_grad=True)
         result = draw(composition, frame.camera, self.background, means2d_offset=offset)
-        image_loss = losses.photometric(result.color, target, self.config.loss.ssim)
+        image_loss = photometric(result.color, target, self.config.loss.ssim)
         loss = image_loss + self._regularisers(composition, frame)
         # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.
         if loss.requires_grad:

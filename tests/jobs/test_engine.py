@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -101,7 +102,10 @@ def test_a_job_can_be_cancelled_requeued_and_rewound_but_runs_under_its_own_limi
 
 
 def test_leaving_stops_what_runs_and_another_worker_can_have_it(engine: Engine) -> None:
+    began = threading.Event()
+
     async def endless(job_id: str) -> Outcome:
+        began.set()
         await asyncio.Event().wait()
         raise AssertionError
 
@@ -110,7 +114,7 @@ def test_leaving_stops_what_runs_and_another_worker_can_have_it(engine: Engine) 
 
     engine.enqueue("a", 10)
     with executing(engine.url, "worker-a", 1, endless):
-        until(lambda: state(engine, "a") is JobState.RUNNING)
+        assert began.wait(10)
     assert [(one.job_id, one.executor) for one in engine.running()] == [("a", "worker-a")]
     engine.requeue(["a"])
     with executing(engine.url, "worker-b", 1, brief):

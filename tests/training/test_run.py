@@ -75,6 +75,17 @@ def _refuse(constant: str) -> float:
     raise AssertionError(f"{constant} is not strict JSON")
 
 
+def test_two_trainers_do_not_share_a_folder(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config())
+    training = iter(run)
+    next(training)
+    with pytest.raises(CheckpointError, match="being trained by another process"):
+        next(iter(TrainingRun.resume(tmp_path / "run")))
+    del training
+    run.save()
+    assert next(iter(TrainingRun.resume(tmp_path / "run"))).iteration == 2
+
+
 def test_any_number_of_threads_trains_the_same_model(capture: Path, tmp_path: Path) -> None:
     for threads in (1, 3):
         list(TrainingRun.create(capture, tmp_path / str(threads), _config(threads=threads)))

@@ -2,6 +2,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -130,12 +131,13 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         nb::gil_scoped_release release;
         graings::differentiate<R>(layers, rows, input.data(), kept, upstream, v_in, w, b, threads);
     });
-    m.def("ssim", [](In<R> image, In<R> target, int64_t height, int64_t width, std::optional<Out<R>> gradient, int threads) {
+    m.def("compare", [](In<R> image, In<R> target, int64_t height, int64_t width, double similarity, double absolute, std::optional<Out<R>> gradient, int threads) {
         const size_t size = size_t(3 * height * width);
         const R *first = checked(image, size, "image"), *second = checked(target, size, "target");
         R* out = checked(gradient, size, "gradient");
         nb::gil_scoped_release release;
-        return graings::ssim<R>(height, width, first, second, out, threads);
+        const auto mean = graings::compare<R>(height, width, first, second, {similarity, absolute}, out, threads);
+        return std::pair(mean.similarity, mean.absolute);
     });
 }
 
@@ -143,7 +145,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
 
 NB_MODULE(_kernel, m) {
     nb::set_leak_warnings(false);  // torch may hold graphs, and with them frames, until the interpreter is gone
-    m.doc() = "Compiled rasterizer; use graings.raster.rasterize and graings.raster.ssim.";
+    m.doc() = "Compiled rasterizer; use graings.raster.rasterize and graings.raster.photometric.";
     bind<float>(m, "FrameFloat", "draw_float");
     bind<double>(m, "FrameDouble", "draw_double");
     m.def("hidden_size", &graings::hidden_size, "widths"_a, "rows"_a, "Elements that a network's hidden activations take.");

@@ -45,8 +45,13 @@ private:
     Buffer<int32_t> processed_, items_;
 };
 
-// Mean structural similarity of two [height, width, 3] images; `gradient` (of the mean) may be null.
+struct Likeness {
+    double similarity, absolute;  // means over pixels and channels
+};
+
+// Mean structural similarity and mean absolute difference of two [height, width, 3] images. `gradient`, which may
+// be null, is that of weights.similarity * similarity + weights.absolute * absolute.
 template <class R>
-double ssim(int64_t height, int64_t width, const R* image, const R* target, R* gradient, int threads);
+Likeness compare(int64_t height, int64_t width, const R* image, const R* target, Likeness weights, R* gradient, int threads);
 
 }  // namespace graings

@@ -114,8 +114,8 @@ struct SsimArgs {
     const R *image, *target;
     R* gradient;    // [height, width, 3] or null
     R* maps;        // three planes [height, width, 3]: what the gradient filters back
-    double* sums;   // one per band
-    double scale;   // 1 / (pixels * channels)
+    double* sums;   // per band: of the similarity and of |image - target|
+    R similarity, absolute;  // what each number counts in the gradient
 };
 
 constexpr int kMaxLayers = 16;

@@ -1,4 +1,4 @@
-"""The oracle of `graings.raster.ssim`: a plain two-dimensional convolution in float64, with autograd."""
+"""The oracle of `graings.raster.photometric`: a plain two-dimensional convolution in float64, with autograd."""
 
 from __future__ import annotations
 
@@ -30,3 +30,9 @@ def ssim(image: Tensor, target: Tensor, *, threads: int | None = None) -> Tensor
     value = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
     value = value / ((mean_x**2 + mean_y**2 + C1) * (variance_x + variance_y + C2))
     return value.clamp(-1, 1).mean().to(image.dtype)
+
+
+def photometric(image: Tensor, target: Tensor, ssim_weight: float, *, threads: int | None = None) -> Tensor:
+    """(1 - w) |image - target|_1 + w (1 - SSIM); `threads` is ignored."""
+    absolute = (image.double() - target.double()).abs().mean().to(image.dtype)
+    return (1.0 - ssim_weight) * absolute + ssim_weight * (1.0 - ssim(image, target))

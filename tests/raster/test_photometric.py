@@ -1,4 +1,4 @@
-"""Fused SSIM: equal to a plain convolution, the same bits on any number of threads, bounded where it is clamped."""
+"""Fused SSIM and L1: equal to plain torch, the same bits on any number of threads, bounded where clamped."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from graings.raster import ssim_reference
-from graings.raster.ssim import ssim
+from graings.raster import photometric_reference
+from graings.raster.photometric import photometric, ssim
 from tests.raster.comparison import UNIT_ROUNDOFF, relative
 
 SIZES = [(1, 1), (1, 7), (5, 5), (17, 33), (33, 47), (40, 3)]
@@ -34,7 +34,7 @@ def with_gradient(
 @pytest.mark.parametrize("size", SIZES)
 def test_double_precision_equals_a_plain_convolution(size: tuple[int, int], isa: str) -> None:
     value, gradient = with_gradient(ssim, *pair(*size))
-    expected, expected_gradient = with_gradient(ssim_reference.ssim, *pair(*size))
+    expected, expected_gradient = with_gradient(photometric_reference.ssim, *pair(*size))
     torch.testing.assert_close(value, expected, rtol=0, atol=1e-12)
     assert relative(gradient, expected_gradient) < 1e-12
 
@@ -43,11 +43,30 @@ def test_double_precision_equals_a_plain_convolution(size: tuple[int, int], isa:
 def test_single_precision_stays_close_to_double(size: tuple[int, int], isa: str) -> None:
     image, target = pair(*size, torch.float32)
     value, gradient = with_gradient(ssim, image, target)
-    expected, expected_gradient = with_gradient(ssim_reference.ssim, image.double(), target.double())
+    expected, expected_gradient = with_gradient(photometric_reference.ssim, image.double(), target.double())
     # Two passes of 11 products in [0, 1]: 24 roundings of moments <= 1, seen through the smallest divisor C2 = 9e-4.
-    bound = 24 * UNIT_ROUNDOFF / ssim_reference.C2
+    bound = 24 * UNIT_ROUNDOFF / photometric_reference.C2
     assert abs(value.double() - expected).item() <= bound
     assert relative(gradient, expected_gradient) <= bound
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("size", SIZES)
+def test_the_mixture_with_l1_equals_torch(size: tuple[int, int], weight: float, isa: str) -> None:
+    image, target = pair(*size)
+    if image.numel() > 3:
+        image[0, 0] = target[0, 0]  # no difference, no direction
+
+    def ours(x: Tensor, y: Tensor) -> Tensor:
+        return photometric(x, y, weight)
+
+    def plain(x: Tensor, y: Tensor) -> Tensor:
+        return photometric_reference.photometric(x, y, weight)
+
+    value, gradient = with_gradient(ours, image, target)
+    expected, expected_gradient = with_gradient(plain, image, target)
+    torch.testing.assert_close(value, expected, rtol=0, atol=1e-12)
+    assert relative(gradient, expected_gradient) < 1e-12
 
 
 @pytest.mark.parametrize("threads", [2, 4])

@@ -1,0 +1,69 @@
+"""How far an image is from its target: structural similarity and absolute difference, with their gradient.
+
+Fused in the compiled kernel. SSIM in the 3DGS definition: 11x11 Gaussian window of sigma 1.5, zero padding,
+C1 = 0.01^2, C2 = 0.03^2, per channel; local variances are clamped at 0 and local values to [-1, 1], with zero
+gradient where clamped. Meant for losses; `graings.metrics` measures. Knows nothing of cameras or Gaussians.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from graings import kernel
+
+
+def ssim(image: Tensor, target: Tensor, *, threads: int | None = None) -> Tensor:
+    """Mean SSIM over pixels and channels of two [H, W, 3] images in [0, 1]; a scalar in [-1, 1].
+
+    Differentiable with respect to `image` only. Raises `ValueError` for a wrong shape, dtype or device and for a
+    `target` that requires a gradient.
+    """
+    return _mixture(image, target, 1.0, 0.0, threads)
+
+
+def photometric(image: Tensor, target: Tensor, ssim_weight: float, *, threads: int | None = None) -> Tensor:
+    """(1 - w) |image - target|_1 + w (1 - SSIM) with w = `ssim_weight`, means over pixels and channels, Eq. 15.
+
+    Arguments and errors are those of `ssim`.
+    """
+    return ssim_weight + _mixture(image, target, -ssim_weight, 1.0 - ssim_weight, threads)
+
+
+def _mixture(image: Tensor, target: Tensor, similarity: float, absolute: float, threads: int | None) -> Tensor:
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ValueError(f"image must have shape (H, W, 3), got {tuple(image.shape)}")
+    if target.shape != image.shape:
+        raise ValueError(f"target must have the shape of image {tuple(image.shape)}, got {tuple(target.shape)}")
+    if image.dtype not in (torch.float32, torch.float64) or target.dtype != image.dtype:
+        raise ValueError(f"image and target must both be float32 or float64, got {image.dtype} and {target.dtype}")
+    if image.device.type != "cpu" or target.device.type != "cpu":
+        raise ValueError(f"image and target must be on the CPU, got {image.device} and {target.device}")
+    if target.requires_grad:
+        raise ValueError("target must not require a gradient: only the first image is differentiated")
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads must be at least 1, got {threads}")
+    workers = kernel.threads() if threads is None else threads
+    value: Tensor = _Comparison.apply(image, target, similarity, absolute, workers)  # type: ignore[no-untyped-call]
+    return value
+
+
+class _Comparison(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, similarity: float, absolute: float, threads: int) -> Tensor:
+        first, second = image.detach().contiguous(), target.detach().contiguous()
+        gradient = torch.empty_like(first) if ctx.needs_input_grad[0] else None
+        height, width, _ = image.shape
+        alike, apart = kernel.kernel().compare(first, second, height, width, similarity, absolute, gradient, threads)
+        if gradient is not None:
+            ctx.save_for_backward(gradient)
+        return image.new_tensor(similarity * alike + absolute * apart)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * upstream, None, None, None, None

@@ -1,0 +1,60 @@
+"""Pace: what a run spends its seconds on, how fast it goes, and when it pauses to look at held-out views.
+
+Knows nothing of what is done in those seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from graings.config import TrainConfig
+
+# The rate shown to the user is the mean over about this many recent seconds.
+RATE_WINDOW_S = 5.0
+
+
+@dataclass(slots=True)
+class Clock:
+    """Seconds per phase; training, evaluation and saving never share a second."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def add(self, phase: str, seconds: float) -> None:
+        """Book `seconds` on a phase of training or on load, evaluation or checkpoint."""
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + seconds
+
+    def train_s(self) -> float:
+        """Seconds of training alone."""
+        return sum(self.seconds.get(phase, 0.0) for phase in ("init", "warmup", "joint", "static"))
+
+    def total_s(self) -> float:
+        """Seconds of everything."""
+        return sum(self.seconds.values())
+
+
+class Rate:
+    """Iterations per second over the last few seconds."""
+
+    def __init__(self) -> None:
+        self._recent: list[float] = []
+        self._sum = 0.0
+
+    def add(self, seconds: float) -> None:
+        """One more step, and how long it took."""
+        self._recent.append(seconds)
+        self._sum += seconds
+        while len(self._recent) > 1 and self._sum - self._recent[0] > RATE_WINDOW_S:
+            self._sum -= self._recent.pop(0)
+
+    def per_second(self) -> float:
+        """Steps per second lately."""
+        return len(self._recent) / max(self._sum, 1e-9)
+
+
+def evaluation_marks(config: TrainConfig) -> frozenset[int]:
+    """Iterations at which to evaluate: geometrically spaced."""
+    marks, mark = set(), float(config.evaluation.first)
+    while mark < config.iterations:
+        marks.add(round(mark))
+        mark *= config.evaluation.factor
+    return frozenset(marks)
