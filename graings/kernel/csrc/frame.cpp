@@ -20,24 +20,40 @@ constexpr int64_t kPiece = 512;  // Gaussians handed to a thread at a time
 
 int64_t pieces_of(int64_t count, int64_t piece) { return (count + piece - 1) / piece; }
 
-// Tiles that a record may touch, row by row: visit(first tile, last tile).
+// Numbers of a pixel or tile, cut to [0, end): rounded down, and rounded up.
+int64_t below(double x, int64_t end) { return x < 0 ? -1 : x >= double(end) ? end - 1 : int64_t(x); }
+int64_t above(double x, int64_t end) {
+    if (!(x > 0)) return 0;
+    if (x > double(end)) return end;
+    const int64_t whole = int64_t(x);
+    return whole + (double(whole) < x);
+}
+
+// Tiles that a record may touch, row by row: visit(row of tiles, first tile column, last one). `extents` are half the
+// width and height of its footprint.
 template <class R, class Visit>
-void each_tile_row(const Record<R>& record, const Camera& camera, bool compat, const R* radii, Visit visit) {
-    const int64_t across = pieces_of(camera.width, kTile), down = pieces_of(camera.height, kTile);
+void each_tile_row(const Record<R>& record, const Camera& camera, bool compat, const R* radii, const double* extents, Visit visit) {
     if (compat) {
-        const auto bound = [](double value, int64_t high) { return int64_t(std::clamp(value, 0.0, double(high))); };
-        const int64_t x0 = bound(std::floor((record.x - double(radii[0])) / kTile), across), x1 = bound(std::ceil((record.x + double(radii[0])) / kTile), across);
-        const int64_t y0 = bound(std::floor((record.y - double(radii[1])) / kTile), down), y1 = bound(std::ceil((record.y + double(radii[1])) / kTile), down);
-        for (int64_t row = y0; row < y1; row++)
-            if (x0 < x1) visit(row * across + x0, row * across + x1 - 1);
+        const int64_t across = pieces_of(camera.width, kTile), down = pieces_of(camera.height, kTile);
+        const int64_t x0 = below((record.x - double(radii[0])) / kTile, across), x1 = above((record.x + double(radii[0])) / kTile, across);
+        const int64_t y0 = below((record.y - double(radii[1])) / kTile, down), y1 = above((record.y + double(radii[1])) / kTile, down);
+        for (int64_t row = std::max<int64_t>(y0, 0); row < y1; row++)
+            if (x0 < x1) visit(row, std::max<int64_t>(x0, 0), x1 - 1);
+        return;
+    }
+    // the pixel centres inside the box
+    const double widest = extents[0], highest = extents[1];
+    const int64_t top = above(record.y - highest - 0.5, camera.height), bottom = below(record.y + highest - 0.5, camera.height);
+    const int64_t left = above(record.x - widest - 0.5, camera.width), right = below(record.x + widest - 0.5, camera.width);
+    if (!(top <= bottom && left <= right)) return;
+    const int64_t first_row = top / kTile, last_row = bottom / kTile, first = left / kTile, last = right / kTile;
+    if (last - first < 2 && last_row - first_row < 2) {  // a tighter look would cost more than the tile it saves
+        for (int64_t row = first_row; row <= last_row; row++) visit(row, first, last);
         return;
     }
     const double level = double(record.level), steep = record.slope * record.sr;
-    const double highest = std::sqrt(level) / record.sy;
     const double turn = highest * steep / std::sqrt(steep * steep + record.sy * record.sy);
-    const double first = std::max(std::ceil(record.y - highest - 0.5), 0.0), last = std::min(std::floor(record.y + highest - 0.5), double(camera.height - 1));
-    if (!(first <= last)) return;
-    for (int64_t row = int64_t(first) / kTile; row <= int64_t(last) / kTile; row++) {
+    for (int64_t row = first_row; row <= last_row; row++) {
         const double low = std::max(double(row * kTile) + 0.5 - record.y, -highest);
         const double high = std::min(double(row * kTile + kTile) - 0.5 - record.y, highest);
         if (low > high) continue;
@@ -45,8 +61,8 @@ void each_tile_row(const Record<R>& record, const Camera& camera, bool compat, c
             const double dy = std::clamp(side * turn, low, high), s = dy * record.sy;
             return record.x + record.slope * dy + side * std::sqrt(std::max(level - s * s, 0.0)) / record.sr;
         };
-        const double from = std::max(std::ceil(edge(-1) - 0.5), 0.0), to = std::min(std::floor(edge(1) - 0.5), double(camera.width - 1));
-        if (from <= to) visit(row * across + int64_t(from) / kTile, row * across + int64_t(to) / kTile);
+        const int64_t from = above(edge(-1) - 0.5, camera.width), to = below(edge(1) - 0.5, camera.width);
+        if (from <= to) visit(row, from / kTile, to / kTile);
     }
 }
 
@@ -56,17 +72,15 @@ template <class R>
 Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads)
     : camera_(camera), settings_(settings), count_(in.count),
       tiles_(pieces_of(camera.width, kTile) * pieces_of(camera.height, kTile)), status_(size_t(in.count)),
-      records_(size_t(in.count)), pair_begin_(size_t(in.count)), pair_count_(size_t(in.count)) {
+      records_(size_t(in.count)), spans_(size_t(in.count)) {
     if (count_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::invalid_argument("more than 2^32 Gaussians");
-    const Kernels<R>& run = kernels<R>();
-    Buffer<double> depths{size_t(count_)};
-    const ProjectArgs<R> project{camera_, settings_, in, records_.get(), status_.get(), depths.get(), out.means2d, out.radii};
-    parallel_for(threads, pieces_of(count_, kPiece), [&](int, int64_t piece) {
-        run.project(project, piece * kPiece, std::min(count_, (piece + 1) * kPiece));
-    });
-    const auto order = sorted(depths.get(), uids);
-    bin(order, out.radii, threads);
+    Buffer<double> depths{size_t(count_)}, extents{2 * size_t(count_)};
+    std::vector<std::vector<uint32_t>> lists{size_t(pieces_of(count_, kPiece))};
+    std::vector<int64_t> counts(size_t(tiles_), 0);
+    project({camera_, settings_, in, records_.get(), status_.get(), depths.get(), extents.get(), out.means2d, out.radii}, lists, counts, threads);
+    bin(sorted(depths.get(), uids), lists, counts, threads);
 
+    const Kernels<R>& run = kernels<R>();
     processed_ = Buffer<int32_t>(size_t(tiles_)), items_ = Buffer<int32_t>(size_t(tiles_));
     TileArgs<R> tiles = tile_args(in.background);
     tiles.color = out.color, tiles.alpha = out.alpha, tiles.depth = out.depth;
@@ -74,8 +88,35 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
     parallel_for(threads, tiles_, [&](int worker, int64_t tile) { run.draw_tile(tiles, tile, chunks.get() + worker * kChunk); });
 }
 
-// Visible Gaussians by (depth, uid): a radix sort on the leading 32 bits of the depth range, then the few runs
-// that agree in them by comparison.
+// Records, and for each piece of Gaussians one list of the tiles they touch; `counts` of them per tile.
+template <class R>
+void Frame<R>::project(const ProjectArgs<R>& args, std::vector<std::vector<uint32_t>>& lists, std::vector<int64_t>& counts, int threads) {
+    const int64_t across = pieces_of(camera_.width, kTile);
+    std::vector<std::vector<int64_t>> own{size_t(threads)};
+    parallel_for(threads, int64_t(lists.size()), [&](int worker, int64_t piece) {
+        const int64_t begin = piece * kPiece, end = std::min(count_, begin + kPiece);
+        kernels<R>().project(args, begin, end);
+        auto& tiles = lists[size_t(piece)];
+        auto& mine = own[size_t(worker)];
+        if (mine.empty()) mine.assign(size_t(tiles_), 0);
+        tiles.reserve(size_t(3 * (end - begin)));
+        for (int64_t i = begin; i < end; i++) {
+            Span& span = spans_[size_t(i)] = {uint32_t(tiles.size()), 0, 1, 0};
+            if (status_[size_t(i)] != kDrawn) continue;
+            each_tile_row(records_[size_t(i)], camera_, settings_.compat, args.radii + 2 * i, args.extents + 2 * i, [&](int64_t row, int64_t from, int64_t to) {
+                if (span.first_row > span.last_row) span.first_row = uint32_t(row);
+                span.last_row = uint32_t(row);
+                for (int64_t tile = row * across + from; tile <= row * across + to; tile++) tiles.push_back(uint32_t(tile)), mine[size_t(tile)]++;
+            });
+            span.count = uint32_t(tiles.size()) - span.begin;
+        }
+    });
+    for (const auto& mine : own)
+        for (size_t tile = 0; tile < mine.size(); tile++) counts[tile] += mine[tile];
+}
+
+// Visible Gaussians by (depth, uid): a radix sort on the leading bits of the depth range, then the few runs that
+// agree in them by comparison.
 template <class R>
 std::vector<uint32_t> Frame<R>::sorted(const double* depths, const int64_t* uids) {
     struct Key { uint32_t key, id; };
@@ -88,13 +129,14 @@ std::vector<uint32_t> Frame<R>::sorted(const double* depths, const int64_t* uids
         least = std::min(least, bits), most = std::max(most, bits), visible++;
     }
     std::vector<Key> keys(visible), spare(visible);
-    const int shift = visible ? std::max(0, int(std::bit_width(most - least)) - 32) : 0;
+    constexpr int kDigit = 11, kPasses = 2;
+    const int shift = visible ? std::max(0, int(std::bit_width(most - least)) - kPasses * kDigit) : 0;
     size_t n = 0;
     for (int64_t i = 0; i < count_; i++)
         if (status_[size_t(i)] == kDrawn) keys[n++] = {uint32_t((std::bit_cast<uint64_t>(depths[i]) - least) >> shift), uint32_t(i)};
-    for (int pass = 0; pass < 3; pass++) {
-        std::vector<size_t> at(2048, 0);
-        const auto digit = [&](const Key& k) { return (k.key >> (11 * pass)) & 2047; };
+    for (int pass = 0; pass < kPasses; pass++) {
+        std::vector<size_t> at(1 << kDigit, 0);
+        const auto digit = [&](const Key& k) { return (k.key >> (kDigit * pass)) & ((1 << kDigit) - 1); };
         for (const Key& k : keys) at[digit(k)]++;
         size_t total = 0;
         for (size_t& start : at) start = std::exchange(total, total + start);
@@ -115,50 +157,44 @@ std::vector<uint32_t> Frame<R>::sorted(const double* depths, const int64_t* uids
     return order;
 }
 
-// A stable counting pass: contiguous runs of the depth order are binned independently, then laid one behind another.
+// Every tile's entries in depth order. Threads take bands of tiles and walk all Gaussians, so that none waits for
+// another; slots follow the Gaussians' own order, so that their sums are read back in sequence.
 template <class R>
-void Frame<R>::bin(const std::vector<uint32_t>& order, const R* radii, int threads) {
-    const int64_t visible = int64_t(order.size());
-    const int64_t runs = std::max<int64_t>(1, std::min<int64_t>(threads, visible));
-    std::vector<std::vector<uint32_t>> touched{size_t(runs)};
-    std::vector<std::vector<int64_t>> cursors{size_t(runs)};
-    const auto first = [&](int64_t run) { return visible * run / runs; };
-    parallel_for(threads, runs, [&](int, int64_t run) {
-        auto& tiles = touched[size_t(run)];
-        auto& counts = cursors[size_t(run)];
-        counts.assign(size_t(tiles_), 0);
-        tiles.reserve(size_t(3 * (first(run + 1) - first(run))));
-        for (int64_t k = first(run); k < first(run + 1); k++) {
-            if (k + 16 < first(run + 1)) __builtin_prefetch(&records_[order[size_t(k + 16)]]);
-            const uint32_t id = order[size_t(k)];
-            pair_begin_[id] = int64_t(tiles.size());
-            each_tile_row(records_[id], camera_, settings_.compat, radii + 2 * size_t(id), [&](int64_t from, int64_t to) {
-                for (int64_t tile = from; tile <= to; tile++) tiles.push_back(uint32_t(tile)), counts[size_t(tile)]++;
-            });
-            pair_count_[id] = int64_t(tiles.size()) - pair_begin_[id];
-        }
-    });
+void Frame<R>::bin(const std::vector<uint32_t>& order, const std::vector<std::vector<uint32_t>>& lists, const std::vector<int64_t>& counts, int threads) {
+    std::vector<int64_t> base(lists.size() + 1, 0);
+    for (size_t piece = 0; piece < lists.size(); piece++) base[piece + 1] = base[piece] + int64_t(lists[piece].size());
+    pairs_ = base.back();
+    if (pairs_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::length_error("more than 2^32 pairs of tile and Gaussian");
     begin_ = Buffer<int64_t>(size_t(tiles_) + 1);
-    for (int64_t tile = 0; tile < tiles_; tile++) {
-        begin_[size_t(tile)] = pairs_;
-        for (auto& counts : cursors) counts[size_t(tile)] = std::exchange(pairs_, pairs_ + counts[size_t(tile)]);
-    }
-    begin_[size_t(tiles_)] = pairs_;
-    ids_ = Buffer<uint32_t>(size_t(pairs_)), slots_ = Buffer<int64_t>(size_t(pairs_)), masks_ = Buffer<uint16_t>(size_t(pairs_));
-    std::vector<int64_t> base(size_t(runs), 0);
-    for (int64_t run = 1; run < runs; run++) base[size_t(run)] = base[size_t(run - 1)] + int64_t(touched[size_t(run - 1)].size());
-    parallel_for(threads, runs, [&](int, int64_t run) {
-        const auto& tiles = touched[size_t(run)];
-        auto& counts = cursors[size_t(run)];
-        for (int64_t k = first(run); k < first(run + 1); k++) {
-            const uint32_t id = order[size_t(k)];
-            for (int64_t pair = pair_begin_[id], end = pair + pair_count_[id]; pair < end; pair++) {
-                const int64_t entry = counts[tiles[size_t(pair)]]++;
-                ids_[size_t(entry)] = id, slots_[size_t(entry)] = base[size_t(run)] + pair;
+    begin_[0] = 0;
+    for (int64_t tile = 0; tile < tiles_; tile++) begin_[size_t(tile) + 1] = begin_[size_t(tile)] + counts[size_t(tile)];
+    ids_ = Buffer<uint32_t>(size_t(pairs_)), slots_ = Buffer<uint32_t>(size_t(pairs_)), masks_ = Buffer<uint16_t>(size_t(pairs_));
+
+    const int64_t across = pieces_of(camera_.width, kTile), down = pieces_of(camera_.height, kTile);
+    std::vector<int64_t> edges{0};  // bands of rows with about as many pairs each
+    for (int64_t row = 1; row < down; row++)
+        if (begin_[size_t(row * across)] * threads >= pairs_ * int64_t(edges.size()) && int64_t(edges.size()) < threads) edges.push_back(row);
+    edges.push_back(down);
+    parallel_for(threads, int64_t(edges.size()) - 1, [&](int, int64_t band) {
+        const int64_t first = edges[size_t(band)], last = edges[size_t(band) + 1] - 1;
+        std::vector<int64_t> cursor(begin_.get() + first * across, begin_.get() + (last + 1) * across);
+        for (size_t k = 0; k < order.size(); k++) {
+            if (k + 16 < order.size()) __builtin_prefetch(&spans_[order[k + 16]]);
+            const uint32_t id = order[k];
+            const Span& span = spans_[id];
+            if (int64_t(span.last_row) < first || int64_t(span.first_row) > last) continue;
+            const size_t piece = id / kPiece;
+            const uint32_t* tiles = lists[piece].data() + span.begin;
+            for (uint32_t i = 0; i < span.count; i++) {
+                const int64_t tile = int64_t(tiles[i]) - first * across;
+                if (tile < 0 || tile >= int64_t(cursor.size())) continue;
+                const int64_t entry = cursor[size_t(tile)]++;
+                ids_[size_t(entry)] = id, slots_[size_t(entry)] = uint32_t(base[piece]) + span.begin + i;
             }
-            pair_begin_[id] += base[size_t(run)];
         }
     });
+    for (size_t piece = 0; piece < lists.size(); piece++)
+        for (int64_t i = int64_t(piece) * kPiece; i < std::min(count_, (int64_t(piece) + 1) * kPiece); i++) spans_[size_t(i)].begin += uint32_t(base[piece]);
 }
 
 template <class R>
@@ -179,7 +215,7 @@ void Frame<R>::gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha,
         Buffer<R> alphas, weights;
     };
     std::vector<Scratch> scratch{size_t(threads)};
-    Buffer<R> sums(size_t(pairs_) * kSums);
+    Buffer<R> sums(size_t(pairs_) * kSlot);
     Buffer<double> v_background(size_t(tiles_) * 3);
     const TileGradientArgs<R> tiles{tile_args(in.background), slots_.get(), v_color, v_alpha, v_depth, sums.get(), v_background.get()};
     parallel_for(threads, tiles_, [&](int worker, int64_t tile) {
@@ -192,7 +228,7 @@ void Frame<R>::gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha,
     for (int64_t tile = 0; tile < tiles_; tile++)
         for (int c = 0; c < 3; c++) ground[c] += v_background[size_t(3 * tile + c)];
     for (int c = 0; c < 3; c++) out.background[c] = R(ground[c]);
-    const GeometryGradientArgs<R> geometry{camera_, settings_, in, status_.get(), records_.get(), pair_begin_.get(), pair_count_.get(), sums.get(),
+    const GeometryGradientArgs<R> geometry{camera_, settings_, in, status_.get(), records_.get(), spans_.get(), sums.get(),
                                            out.means, out.quats, out.log_scales, out.opacities, out.colors, out.offset};
     parallel_for(threads, pieces_of(count_, kPiece), [&](int, int64_t piece) {
         run.geometry_gradient(geometry, piece * kPiece, std::min(count_, (piece + 1) * kPiece));

@@ -29,8 +29,9 @@ public:
     int64_t pairs() const { return pairs_; }
 
 private:
+    void project(const ProjectArgs<R>&, std::vector<std::vector<uint32_t>>& lists, std::vector<int64_t>& counts, int threads);
     std::vector<uint32_t> sorted(const double* depths, const int64_t* uids);
-    void bin(const std::vector<uint32_t>& order, const R* radii, int threads);
+    void bin(const std::vector<uint32_t>& order, const std::vector<std::vector<uint32_t>>& lists, const std::vector<int64_t>& counts, int threads);
     TileArgs<R> tile_args(const R* background) const;
 
     Camera camera_;
@@ -39,8 +40,9 @@ private:
     int64_t statuses_[kStatuses] = {};
     Buffer<uint8_t> status_;
     Buffer<Record<R>> records_;
-    Buffer<int64_t> begin_, pair_begin_, pair_count_, slots_;
-    Buffer<uint32_t> ids_;
+    Buffer<Span> spans_;
+    Buffer<int64_t> begin_;
+    Buffer<uint32_t> ids_, slots_;
     Buffer<uint16_t> masks_;
     Buffer<int32_t> processed_, items_;
 };

@@ -116,7 +116,13 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         const Projected p = project_group(args.camera, s, in, group);
         const D footprint = (p.x - p.x) + (p.y - p.y) + (p.slope - p.slope) + (p.v - p.v) + (p.c - p.c) + (p.a - p.a);
         const D sr = sqrt(d8(0.5 * kLog2E) / p.v), sy = sqrt(d8(0.5 * kLog2E) / p.c);
-        double finite[8], bounded[8], squared[8], z[8], x[8], y[8], slope[8], a[8], c[8], sr_[8], sy_[8];
+        // Beyond `level` nothing is drawn. The pixel decides; extents only save work, so they are widened by more than
+        // any rounding of the exponent.
+        const D level = s.alpha_min > 0 ? log2(gather(in.opacities, 1, 0, group, in.count) / d8(s.alpha_min)) : d8(1e30);
+        const D widened = min(fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30)), tilt = p.slope * sr / sy, root = sqrt(widened);
+        const D high = root / sy, wide = root * sqrt(fma(tilt, tilt, d8(1))) / sr;
+        double finite[8], bounded[8], squared[8], z[8], x[8], y[8], slope[8], a[8], c[8], sr_[8], sy_[8], level_[8], widened_[8], high_[8], wide_[8];
+        store(level_, level), store(widened_, widened), store(high_, high), store(wide_, wide);
         store(finite, p.finite), store(bounded, footprint), store(squared, p.squared), store(z, p.z), store(x, p.x);
         store(y, p.y), store(slope, p.slope), store(a, p.a), store(c, p.c), store(sr_, sr), store(sy_, sy);
         for (int lane = 0; lane < kGroup && group + lane < end; lane++) {
@@ -130,9 +136,7 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
             if (!(z[lane] > s.near)) { args.status[i] = kBehind; continue; }
             if (!(opacity > s.alpha_min)) { args.status[i] = kFaint; continue; }
             if (!(bounded[lane] == 0)) { args.status[i] = kNonFinite; continue; }
-            double radius_x, radius_y, level;
-            if (s.alpha_min > 0) level = __builtin_log2(opacity / s.alpha_min);
-            else level = __builtin_inf();
+            double radius_x, radius_y;
             if (s.compat) {
                 const double covariance = slope[lane] * c[lane], half = 0.5 * (a[lane] - c[lane]);
                 const double largest = 0.5 * (a[lane] + c[lane]) + __builtin_sqrt(half * half + covariance * covariance);
@@ -141,7 +145,7 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
                     __builtin_floor((y[lane] - radius_y) / kTile) >= __builtin_ceil(height / kTile) || __builtin_ceil((y[lane] + radius_y) / kTile) <= 0 ||
                     radius_x == 0) { args.status[i] = kOutside; continue; }
             } else {
-                const double reach = 2 * kLn2 * level;
+                const double reach = s.alpha_min > 0 ? 2 * kLn2 * level_[lane] : __builtin_inf();
                 radius_x = __builtin_sqrt(reach * a[lane]), radius_y = __builtin_sqrt(reach * c[lane]);
                 if (!(x[lane] - radius_x <= width + 0.5 && x[lane] + radius_x >= -0.5 && y[lane] - radius_y <= height + 0.5 &&
                       y[lane] + radius_y >= -0.5)) { args.status[i] = kOutside; continue; }
@@ -150,10 +154,9 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
             args.depths[i] = z[lane];
             args.means2d[2 * i] = R(x[lane]), args.means2d[2 * i + 1] = R(y[lane]);
             args.radii[2 * i] = R(radius_x), args.radii[2 * i + 1] = R(radius_y);
-            // The pixel decides; extents only save work, so they are widened by more than any rounding of the exponent.
-            const double widened = level * (1 + 1e-5) + 1e-5;
+            args.extents[2 * i] = wide_[lane], args.extents[2 * i + 1] = high_[lane];
             args.records[i] = {x[lane], y[lane], slope[lane], sr_[lane], sy_[lane], in.opacities[i], in.colors[3 * i],
-                               in.colors[3 * i + 1], in.colors[3 * i + 2], R(z[lane]), R(widened < 1e30 ? widened : 1e30)};
+                               in.colors[3 * i + 1], in.colors[3 * i + 2], R(z[lane]), R(widened_[lane])};
         }
     }
 }
@@ -175,9 +178,9 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
             if (i >= end || args.status[i] != kDrawn) continue;
             drawn = true;
             sr_[lane] = args.records[i].sr, sy_[lane] = args.records[i].sy, opacity[lane] = double(in.opacities[i]);
-            const R* slot = args.sums + args.pair_begin[i] * kSums;
+            const R* slot = args.sums + int64_t(args.spans[i].begin) * kSlot;
             double total[kSums] = {};
-            for (int64_t pair = 0; pair < args.pair_count[i]; pair++, slot += kSums)
+            for (uint32_t pair = 0; pair < args.spans[i].count; pair++, slot += kSlot)
                 for (int q = 0; q < kSums; q++) total[q] += double(slot[q]);
             for (int q = 0; q < kSums; q++) sums[q][lane] = total[q];
         }

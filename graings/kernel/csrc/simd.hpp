@@ -45,6 +45,8 @@ GRAINGS_INLINE Native<float> choose(__mmask16 m, Native<float> a, Native<float> 
 GRAINGS_INLINE Native<double> choose(__mmask8 m, Native<double> a, Native<double> b) { return (Native<double>)_mm512_mask_blend_pd(m, (__m512d)b, (__m512d)a); }
 GRAINGS_INLINE bool some(__mmask16 m) { return m != 0; }
 GRAINGS_INLINE bool some(__mmask8 m) { return m != 0; }
+GRAINGS_INLINE uint32_t bits_of(__mmask16 m) { return m; }
+GRAINGS_INLINE uint32_t bits_of(__mmask8 m) { return m; }
 GRAINGS_INLINE Native<float> fused(Native<float> a, Native<float> b, Native<float> c) { return (Native<float>)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
 GRAINGS_INLINE Native<double> fused(Native<double> a, Native<double> b, Native<double> c) { return (Native<double>)_mm512_fmadd_pd((__m512d)a, (__m512d)b, (__m512d)c); }
 GRAINGS_INLINE Native<float> least(Native<float> a, Native<float> b) { return (Native<float>)_mm512_min_ps((__m512)a, (__m512)b); }
@@ -63,6 +65,15 @@ template <class M> GRAINGS_INLINE bool some(M m) {
     bool any = false;
     for (int i = 0; i < static_cast<int>(sizeof(M) / sizeof(m[0])); i++) any |= m[i] != 0;
     return any;
+}
+template <class M> GRAINGS_INLINE uint32_t bits_of(M m) {
+#if defined(__AVX2__)
+    if constexpr (sizeof(m[0]) == 4) return uint32_t(_mm256_movemask_ps((__m256)m));
+    else return uint32_t(_mm256_movemask_pd((__m256d)m));
+#endif
+    uint32_t bits = 0;
+    for (int i = 0; i < static_cast<int>(sizeof(M) / sizeof(m[0])); i++) bits |= uint32_t(m[i] != 0) << i;
+    return bits;
 }
 template <class V> GRAINGS_INLINE V least(V a, V b) { return a < b ? a : b; }
 template <class V> GRAINGS_INLINE V most(V a, V b) { return a > b ? a : b; }
@@ -161,6 +172,21 @@ GRAINGS_VEC bool any(Mask<T, N> m) {
     if constexpr (kOne<T, N>) return some(m.v);
     else return any(m.lo) || any(m.hi);
 }
+// One bit per number, the first lowest.
+GRAINGS_VEC uint32_t bits(Mask<T, N> m) {
+    if constexpr (kOne<T, N>) return bits_of(m.v);
+    else return bits(m.lo) | bits(m.hi) << (N / 2);
+}
+GRAINGS_VEC Vec<T, N> abs(Vec<T, N> a) { return max(a, splat<T, N>(T(0)) - a); }
+// Rounded to R and stored.
+template <class R, int N> GRAINGS_INLINE void store_as(R* p, Vec<double, N> a) {
+    if constexpr (sizeof(R) == sizeof(double)) store(p, a);
+    else if constexpr (kOne<double, N>) {
+        typedef float Half __attribute__((vector_size(kBytes / 2)));
+        const Half rounded = __builtin_convertvector(a.v, Half);
+        std::memcpy(p, &rounded, sizeof rounded);
+    } else { store_as<R>(p, a.lo); store_as<R>(p + N / 2, a.hi); }
+}
 GRAINGS_VEC T sum(Vec<T, N> a) {
     if constexpr (kOne<T, N>) return total(a.v);
     else return sum(a.lo + a.hi);
@@ -218,6 +244,31 @@ template <int N> GRAINGS_INLINE Vec<double, N> exp(Vec<double, N> x) {
     auto p = splat<double, N>(c[0]);
     for (int k = 1; k < 14; k++) p = fma(p, f, splat<double, N>(c[k]));
     return scale_by_power(p, shifted);
+}
+// x = fraction * 2^power with the fraction in [sqrt(1/2), sqrt(2)), for positive normal numbers
+template <int N> GRAINGS_INLINE void split_power(Vec<double, N> x, Vec<double, N>& power, Vec<double, N>& fraction) {
+    if constexpr (kOne<double, N>) {
+        typedef NativeBits<double> I;
+        const I bits = (I)x.v, above = (bits & 0xFFFFFFFFFFFFF) > 0x6A09E667F3BCC ? I{} + 1 : I{};  // of the fraction in [1, 2)
+        power.v = __builtin_convertvector((bits >> 52) - 1023 + above, Native<double>);
+        fraction.v = (Native<double>)((bits & 0xFFFFFFFFFFFFF) | ((I{} + 1023 - above) << 52));
+    } else {
+        split_power(x.lo, power.lo, fraction.lo);
+        split_power(x.hi, power.hi, fraction.hi);
+    }
+}
+// log2 of positive normal numbers, to 2e-16 relative to max(1, |result|)
+template <int N> GRAINGS_INLINE Vec<double, N> log2(Vec<double, N> x) {
+    Vec<double, N> power, fraction;
+    split_power(x, power, fraction);  // fraction in [sqrt(1/2), sqrt(2))
+    const auto one = splat<double, N>(1);
+    const auto s = (fraction - one) / (fraction + one), q = s * s;
+    // 2 / ln 2 * atanh(s) with |s| <= 0.1716
+    constexpr double c[] = {0.1373995277037108, 0.15186263588304877, 0.16972882833987804, 0.19235933878519512, 0.22195308321368667, 0.2623081892525388,
+                            0.3205988979753252, 0.4121985831111324,  0.5770780163555853,  0.9617966939259756,  2.8853900817779268};
+    auto p = splat<double, N>(c[0]);
+    for (int k = 1; k < 11; k++) p = fma(p, q, splat<double, N>(c[k]));
+    return fma(p, s, power);
 }
 #undef GRAINGS_VEC
 

@@ -9,79 +9,73 @@ namespace graings::GRAINGS_ISA {
 template <class R> using P = Vec<R, kLanes>;
 template <class R> GRAINGS_INLINE P<R> p16(R x) { return splat<R, kLanes>(x); }
 
-GRAINGS_INLINE double at_least(double a, double b) { return a > b ? a : b; }
-GRAINGS_INLINE double at_most(double a, double b) { return a < b ? a : b; }
-
-// Blocks of the tile at (left, top) that the ellipse of `record` reaches: bit 4 * row + column.
-// Per row of blocks the ellipse is cut at the row's first and last pixel centres; there its largest x is
-// exact, because slope * dy + half-width(dy) is concave.
+// Of a tile's blocks: first pixel column and row.
+alignas(64) constexpr double kBlockX[kBlocks] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
+alignas(64) constexpr double kBlockY[kBlocks] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
+// Of a block's pixels: distance from its centre.
+alignas(64) constexpr double kColumns[kLanes] = {-1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5};
+alignas(64) constexpr double kRows[kLanes] = {-1.5, -1.5, -1.5, -1.5, -0.5, -0.5, -0.5, -0.5, 0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5};
 template <class R>
-GRAINGS_INLINE uint32_t block_mask(const Record<R>& record, double left, double top) {
-    const double level = double(record.level), steep = record.slope * record.sr;
-    const double highest = __builtin_sqrt(level) / record.sy;
-    const double turn = highest * steep / __builtin_sqrt(steep * steep + record.sy * record.sy);
-    const double x0 = record.x - left, y0 = record.y - top;
-    // lanes: the four rows of blocks to the right of the mean, then the same rows to the left
-    using V = Vec<double, 8>;
-    alignas(64) static constexpr double kFirstRow[8] = {0.5, 4.5, 8.5, 12.5, 0.5, 4.5, 8.5, 12.5};
-    alignas(64) static constexpr double kSide[8] = {1, 1, 1, 1, -1, -1, -1, -1};
-    const V side = load<8>(kSide), first_row = load<8>(kFirstRow) - splat<double, 8>(y0);
-    const V from = max(first_row, splat<double, 8>(-highest)), to = min(first_row + splat<double, 8>(3), splat<double, 8>(highest));
-    const V dy = clamp(side * splat<double, 8>(turn), from, to);
-    const V scaled = dy * splat<double, 8>(record.sy);
-    const V room = max(splat<double, 8>(level) - scaled * scaled, splat<double, 8>(0));
-    const V edge = splat<double, 8>(x0) + splat<double, 8>(record.slope) * dy + side * sqrt(room) * splat<double, 8>(1 / record.sr);
-    // a block column b holds the pixel centres 4b + 0.5 ... 4b + 3.5
-    double columns[8];
-    store(columns, clamp((edge - select(splat<double, 8>(0) < side, splat<double, 8>(0.5), splat<double, 8>(3.5))) * splat<double, 8>(0.25),
-                         splat<double, 8>(-2), splat<double, 8>(5)));
-    double low[8], high[8];
-    store(low, from), store(high, to);
-    uint32_t mask = 0;
-    for (int row = 0; row < 4; row++) {
-        if (!(low[row] <= high[row])) continue;
-        const int last = int(__builtin_floor(columns[row]));
-        int first = int(__builtin_ceil(columns[4 + row]));
-        if (first < 0) first = 0;
-        if (first > last || last < 0 || first > 3) continue;
-        const uint32_t bits = ((2u << (last > 3 ? 3 : last)) - 1) & ~((1u << first) - 1);
-        mask |= bits << (4 * row);
-    }
-    return mask;
+GRAINGS_INLINE P<R> lanes_of(const double* numbers) {
+    R lanes[kLanes];
+    store_as<R>(lanes, load<kLanes>(numbers));
+    return load<kLanes>(lanes);
 }
 
 // Scaled distances are rounded to R only here, relative to the block, so that they stay accurate however far
 // the mean is and however long the needle.
 template <class R>
-GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top) {
-    const double tilt = record.sr * record.slope;
-    const double dy = top + 2 - record.y;
+GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top, P<R> columns, P<R> rows) {
+    using W = Vec<double, kBlocks>;
+    const double tilt = record.sr * record.slope, dy = top + 2 - record.y;
     const double r = record.sr * ((left + 2 - record.x) - record.slope * dy), s = record.sy * dy;
-    const R sr = R(record.sr), lean = R(tilt);
-    for (int row = 0; row < 4; row++) {
-        entry.center_s[row] = R(s + record.sy * (4 * row));
-        for (int column = 0; column < 4; column++) {
-            entry.center_r[4 * row + column] = R(r + record.sr * (4 * column) - tilt * (4 * row));
-            entry.spread[4 * row + column] = sr * R(column - 1.5) - lean * R(row - 1.5);
-        }
-    }
+    const W x = load<kBlocks>(kBlockX), y = load<kBlocks>(kBlockY), wide = splat<double, kBlocks>(record.sr), tilted = splat<double, kBlocks>(-tilt);
+    store_as<R>(entry.center_r, fma(wide, x, fma(tilted, y, splat<double, kBlocks>(r))));
+    store_as<R>(entry.center_s, fma(splat<double, kBlocks>(record.sy), y, splat<double, kBlocks>(s)));
+    store(entry.spread, p16(R(record.sr)) * columns - p16(R(tilt)) * rows);
     entry.sy = R(record.sy), entry.opacity = record.opacity, entry.depth = record.depth;
     entry.red = record.red, entry.green = record.green, entry.blue = record.blue;
 }
 
-alignas(64) constexpr double kRows[kLanes] = {-1.5, -1.5, -1.5, -1.5, -0.5, -0.5, -0.5, -0.5, 0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5};
+// Blocks that a prepared entry reaches, one bit each: those where the least exponent over the rectangle of pixel
+// centres is at most the record's level. With u = |r| less half the width of the block, or 0, the exponent
+// u^2 + s^2 is convex in dy and smooth. Where s is least, either u is 0 and nothing is lower, or the lowest point
+// lies on the side of r's sign, where u is linear, or at an end. `slack` is more than all rounding of r, s and
+// those points, here and in the pixels.
 template <class R>
-GRAINGS_INLINE P<R> lane_rows() {
-    R rows[kLanes];
-    for (int i = 0; i < kLanes; i++) rows[i] = R(kRows[i]);
-    return load<kLanes>(rows);
+GRAINGS_INLINE uint32_t reached_blocks(const TileEntry<R>& entry, const Record<R>& record) {
+    constexpr R unit = sizeof(R) == 4 ? R(1e-6) : R(2e-15);
+    const auto size = [](R x) { return x < R(0) ? -x : x; };
+    const R sr = R(record.sr), sy = R(record.sy), lean = R(record.sr * record.slope), steep = size(lean), fall = R(1) / (lean * lean + sy * sy);
+    const R slack = unit * (size(entry.center_r[0]) + size(entry.center_s[0]) + R(32) * (sr + sy + steep));
+    const P<R> zero = p16(R(0)), high = p16(R(1.5)), low = p16(R(-1.5)), wide = p16(R(1.5) * sr + slack), loose = p16(slack);
+    const P<R> r = load<kBlocks>(entry.center_r), s = load<kBlocks>(entry.center_s), level = p16(record.level);
+    const auto out = [&](P<R> t, P<R> dy) {
+        const P<R> u = max(abs(t) - wide, zero), v = max(abs(fma(p16(sy), dy, s)) - loose, zero);
+        return bits(level < fma(u, u, v * v));
+    };
+    const P<R> flat = clamp(p16(R(-1) / sy) * s, low, high), t = r - p16(lean) * flat;
+    const P<R> side = select(t < zero, p16(R(-1.5) * sr), p16(R(1.5) * sr));
+    const P<R> lowest = clamp(p16(lean * fall) * (r - side) - p16(sy * fall) * s, low, high);
+    return ~(out(t, flat) & out(r - p16(lean) * lowest, lowest));
 }
 
+// entries[b]: which of n <= 32 masks have bit b.
+GRAINGS_INLINE void by_block(const uint16_t* masks, uint32_t* entries) {
+#if defined(__AVX512BW__)
+    const __m512i all = _mm512_loadu_si512(masks);
+    for (int b = 0; b < kBlocks; b++) entries[b] = _mm512_test_epi16_mask(all, _mm512_set1_epi16(short(1 << b)));
+#else
+    std::memset(entries, 0, sizeof(uint32_t) * kBlocks);
+    for (int j = 0; j < kChunk; j++)
+        for (int b = 0; b < kBlocks; b++) entries[b] |= uint32_t(masks[j] >> b & 1) << j;
+#endif
+}
 template <class R> struct Distance { P<R> r, s; };
 
 template <class R>
 GRAINGS_INLINE Distance<R> distance(const TileEntry<R>& entry, int block, P<R> rows) {
-    return {load<kLanes>(entry.spread) + p16(entry.center_r[block]), fma(rows, p16(entry.sy), p16(entry.center_s[block >> 2]))};
+    return {load<kLanes>(entry.spread) + p16(entry.center_r[block]), fma(rows, p16(entry.sy), p16(entry.center_s[block]))};
 }
 
 template <class R>
@@ -145,7 +139,7 @@ template <class R, bool Compat>
 GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
     const TileBox box = tile_box(args.camera, tile);
     const Rule<R> limits = rule<R>(args.settings);
-    const P<R> rows = lane_rows<R>();
+    const P<R> columns = lanes_of<R>(kColumns), rows = lanes_of<R>(kRows);
     alignas(64) R open[kBlocks][kLanes], left[kBlocks][kLanes], channels[4][kBlocks][kLanes];
     uint32_t live = open_lanes(box, open);
     std::memcpy(left, open, sizeof left);
@@ -156,26 +150,24 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
     int32_t items = 0;
     while (k < end && live) {
         const int n = int(end - k < kChunk ? end - k : kChunk);
-        uint32_t masks[kChunk];
+        uint16_t masks[kChunk] = {};
+        uint32_t lists[kBlocks];
         for (int j = 0; j < n; j++) {
             if (k + j + 8 < end) __builtin_prefetch(&args.records[args.ids[k + j + 8]]);
             const Record<R>& record = args.records[args.ids[k + j]];
-            masks[j] = (Compat ? 0xFFFFu : block_mask(record, double(box.left), double(box.top))) & live;
-            args.masks[k + j] = uint16_t(masks[j]);
+            prepare(chunk[j], record, double(box.left), double(box.top), columns, rows);
+            args.masks[k + j] = masks[j] = uint16_t((Compat ? 0xFFFFu : reached_blocks(chunk[j], record)) & live);
             items += __builtin_popcount(masks[j]);
-            if (masks[j]) prepare(chunk[j], record, double(box.left), double(box.top));
         }
         k += n;
+        by_block(masks, lists);
         for (int b = 0; b < kBlocks; b++) {
-            if (!(live >> b & 1)) continue;
-            int list[kChunk], count = 0;
-            for (int j = 0; j < n; j++) list[count] = j, count += masks[j] >> b & 1;
-            if (count == 0) continue;
+            if (lists[b] == 0) continue;
             P<R> t = load<kLanes>(open[b]), rest = load<kLanes>(left[b]);
             P<R> red = load<kLanes>(channels[0][b]), green = load<kLanes>(channels[1][b]);
             P<R> blue = load<kLanes>(channels[2][b]), depth = load<kLanes>(channels[3][b]);
-            for (int i = 0; i < count; i++) {
-                const TileEntry<R>& entry = chunk[list[i]];
+            for (uint32_t list = lists[b]; list; list &= list - 1) {
+                const TileEntry<R>& entry = chunk[__builtin_ctz(list)];
                 const P<R> alpha = drawn_alpha(uncapped_alpha(entry, distance(entry, b, rows)), limits);
                 const P<R> weight = blend<R, Compat>(alpha, limits, t, rest);
                 red = fma(weight, p16(entry.red), red);
@@ -191,23 +183,71 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
     args.processed[tile] = int32_t(k - start);
     args.items[tile] = items;
 
-    const R ground[3] = {args.background[0], args.background[1], args.background[2]};
-    for (int b = 0; b < kBlocks; b++)
-        for (int l = 0; l < kLanes; l++) {
-            const int x = lane_x(b, l), y = lane_y(b, l);
-            if (x >= box.width || y >= box.height) continue;
-            const int64_t pixel = (box.top + y) * args.camera.width + box.left + x;
-            const R t = left[b][l];
-            for (int c = 0; c < 3; c++) args.color[3 * pixel + c] = channels[c][b][l] + t * ground[c];
-            args.alpha[pixel] = R(1) - t;
-            args.depth[pixel] = channels[3][b][l];
+    for (int b = 0; b < kBlocks; b++) {
+        const P<R> t = load<kLanes>(left[b]);
+        for (int c = 0; c < 3; c++) store(channels[c][b], fma(t, p16(args.background[c]), load<kLanes>(channels[c][b])));
+        store(left[b], p16(R(1)) - t);
+    }
+    for (int y = 0; y < box.height; y++) {
+        R color[3 * kTile], alpha[kTile], depth[kTile];
+        for (int x = 0; x < kTile; x++) {
+            const int b = (y >> 2) * 4 + (x >> 2), l = (y & 3) * 4 + (x & 3);
+            color[3 * x] = channels[0][b][l], color[3 * x + 1] = channels[1][b][l], color[3 * x + 2] = channels[2][b][l];
+            alpha[x] = left[b][l], depth[x] = channels[3][b][l];
         }
+        const int64_t pixel = (box.top + y) * args.camera.width + box.left;
+        std::memcpy(args.color + 3 * pixel, color, sizeof(R) * size_t(3 * box.width));
+        std::memcpy(args.alpha + pixel, alpha, sizeof(R) * size_t(box.width));
+        std::memcpy(args.depth + pixel, depth, sizeof(R) * size_t(box.width));
+    }
+}
+
+// A tile that nothing touches.
+template <class R>
+GRAINGS_INLINE void draw_background(const TileArgs<R>& args, int64_t tile) {
+    const TileBox box = tile_box(args.camera, tile);
+    args.processed[tile] = args.items[tile] = 0;
+    R color[3 * kTile];
+    for (int i = 0; i < 3 * kTile; i++) color[i] = args.background[i % 3];
+    for (int64_t y = 0; y < box.height; y++) {
+        const int64_t pixel = (box.top + y) * args.camera.width + box.left;
+        std::memcpy(args.color + 3 * pixel, color, sizeof(R) * size_t(3 * box.width));
+        std::memset(args.alpha + pixel, 0, sizeof(R) * size_t(box.width));
+        std::memset(args.depth + pixel, 0, sizeof(R) * size_t(box.width));
+    }
 }
 
 template <class R>
 static void draw_tile(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
-    if (args.settings.compat) draw<R, true>(args, tile, chunk);
+    if (args.begin[tile] == args.begin[tile + 1]) draw_background(args, tile);
+    else if (args.settings.compat) draw<R, true>(args, tile, chunk);
     else draw<R, false>(args, tile, chunk);
+}
+
+// out[q] = sum of the 16 numbers of v[q], for twelve of them at once.
+template <class R>
+GRAINGS_INLINE void sums_of_twelve(const P<R>* v, R* out) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4) {
+        // Halve three times, two vectors into one each time; each keeps its own part of the lanes.
+        const auto halves = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xDD)); };
+        const auto pairs = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_shuffle_ps(a, b, 0x88), _mm512_shuffle_ps(a, b, 0xDD)); };
+        __m512 quarter[3];
+        for (int i = 0; i < 3; i++) {
+            const P<R>* four = v + 4 * i;
+            // lanes 4q..4q+3: the four partial sums of vector q
+            quarter[i] = halves(halves((__m512)four[0].v, (__m512)four[1].v), halves((__m512)four[2].v, (__m512)four[3].v));
+        }
+        const __m512 last = pairs(pairs(quarter[0], quarter[1]), pairs(quarter[2], quarter[2]));
+        // quad q: vector q of quarters 0, 1, 2, 2
+        R lanes[kLanes];
+        std::memcpy(lanes, &last, sizeof lanes);
+        for (int i = 0; i < 3; i++)
+            for (int q = 0; q < 4; q++) out[4 * i + q] = lanes[4 * q + i];
+        return;
+    }
+#endif
+    for (int q = 0; q < kSlot; q++) out[q] = sum(v[q]);
 }
 
 template <class R, bool Compat, bool Extra>
@@ -215,26 +255,39 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const
     const TileArgs<R>& args = all.tiles;
     const TileBox box = tile_box(args.camera, tile);
     const Rule<R> limits = rule<R>(args.settings);
-    const P<R> rows = lane_rows<R>(), zero = p16(R(0));
+    const P<R> columns = lanes_of<R>(kColumns), rows = lanes_of<R>(kRows), zero = p16(R(0));
     const int64_t begin = args.begin[tile], end = args.begin[tile + 1];
     double* v_ground = all.v_background + 3 * tile;
     v_ground[0] = v_ground[1] = v_ground[2] = 0;
 
     // upstream: colour, then alpha, then depth
     alignas(64) R up[5][kBlocks][kLanes];
-    bool silent = true;
-    for (int b = 0; b < kBlocks; b++)
-        for (int l = 0; l < kLanes; l++) {
-            const int x = lane_x(b, l), y = lane_y(b, l);
-            const bool inside = x < box.width && y < box.height;
-            const int64_t pixel = (box.top + y) * args.camera.width + box.left + x;
-            for (int c = 0; c < 3; c++) up[c][b][l] = inside ? all.v_color[3 * pixel + c] : R(0);
-            up[3][b][l] = Extra && inside && all.v_alpha ? all.v_alpha[pixel] : R(0);
-            up[4][b][l] = Extra && inside && all.v_depth ? all.v_depth[pixel] : R(0);
-            for (int c = 0; c < 5; c++) silent &= up[c][b][l] == R(0);
+    typename Bits<R>::type noise = 0;  // a NaN is not silence
+    const auto hear = [&](const R* row, int n) {
+        for (int i = 0; i < n; i++) {
+            typename Bits<R>::type word;
+            std::memcpy(&word, row + i, sizeof word);
+            noise |= word << 1;  // -0 is 0
         }
+    };
+    for (int y = 0; y < kTile; y++) {
+        R color[3 * kTile] = {}, alpha[kTile] = {}, depth[kTile] = {};
+        if (y < box.height) {
+            const int64_t pixel = (box.top + y) * args.camera.width + box.left;
+            std::memcpy(color, all.v_color + 3 * pixel, sizeof(R) * size_t(3 * box.width));
+            hear(color, 3 * kTile);
+            if (Extra && all.v_alpha) std::memcpy(alpha, all.v_alpha + pixel, sizeof(R) * size_t(box.width)), hear(alpha, kTile);
+            if (Extra && all.v_depth) std::memcpy(depth, all.v_depth + pixel, sizeof(R) * size_t(box.width)), hear(depth, kTile);
+        }
+        for (int x = 0; x < kTile; x++) {
+            const int b = (y >> 2) * 4 + (x >> 2), l = (y & 3) * 4 + (x & 3);
+            for (int c = 0; c < 3; c++) up[c][b][l] = color[3 * x + c];
+            if constexpr (Extra) up[3][b][l] = alpha[x], up[4][b][l] = depth[x];
+        }
+    }
+    const bool silent = noise == 0;
     if (silent) {
-        for (int64_t k = begin; k < end; k++) std::memset(all.sums + all.slots[k] * kSums, 0, sizeof(R) * kSums);
+        for (int64_t k = begin; k < end; k++) std::memset(all.sums + int64_t(all.slots[k]) * kSlot, 0, sizeof(R) * kSlot);
         return;
     }
 
@@ -244,26 +297,37 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const
     std::memcpy(left, open, sizeof left);
     const int n = args.processed[tile];
     int32_t item = 0;
-    for (int j = 0; j < n; j++) {
-        scratch.first_item[j] = item;
-        uint32_t mask = args.masks[begin + j];
-        if (!mask) continue;
-        if (j + 8 < n) __builtin_prefetch(&args.records[args.ids[begin + j + 8]]);
-        TileEntry<R>& entry = scratch.entries[j];
-        prepare(entry, args.records[args.ids[begin + j]], double(box.left), double(box.top));
-        for (; mask; mask &= mask - 1, item++) {
-            const int b = __builtin_ctz(mask);
+    for (int first = 0; first < n; first += kChunk) {
+        const int count = n - first < kChunk ? n - first : kChunk;
+        uint16_t masks[kChunk] = {};
+        uint32_t lists[kBlocks];
+        for (int i = 0; i < count; i++) {
+            const int j = first + i;
+            if (j + 8 < n) __builtin_prefetch(&args.records[args.ids[begin + j + 8]]);
+            masks[i] = args.masks[begin + j];
+            scratch.first_item[j] = item;
+            item += __builtin_popcount(masks[i]);
+            if (masks[i]) prepare(scratch.entries[j], args.records[args.ids[begin + j]], double(box.left), double(box.top), columns, rows);
+        }
+        by_block(masks, lists);
+        for (int b = 0; b < kBlocks; b++) {
+            if (lists[b] == 0) continue;
             P<R> t = load<kLanes>(open[b]), rest = load<kLanes>(left[b]);
-            const P<R> was_open = t;
-            const P<R> raw = uncapped_alpha(entry, distance(entry, b, rows));
-            const P<R> alpha = drawn_alpha(raw, limits);
-            const P<R> weight = blend<R, Compat>(alpha, limits, t, rest);
+            for (uint32_t list = lists[b]; list; list &= list - 1) {
+                const int i = __builtin_ctz(list);
+                const int64_t at = (scratch.first_item[first + i] + __builtin_popcount(masks[i] & ((1u << b) - 1))) * kLanes;
+                const TileEntry<R>& entry = scratch.entries[first + i];
+                const P<R> was_open = t;
+                const P<R> raw = uncapped_alpha(entry, distance(entry, b, rows));
+                const P<R> alpha = drawn_alpha(raw, limits);
+                const P<R> weight = blend<R, Compat>(alpha, limits, t, rest);
+                // a stopped lane behaves as if the entry were not there
+                P<R> kept = select(zero < was_open, alpha, zero);
+                if constexpr (Compat) kept = select(zero < weight, alpha, zero);
+                store(scratch.alphas + at, kept);
+                store(scratch.weights + at, select(p16(limits.alpha_max) < raw, zero - weight, weight));
+            }
             store(open[b], t), store(left[b], rest);
-            // a stopped lane behaves as if the entry were not there
-            P<R> kept = select(zero < was_open, alpha, zero);
-            if constexpr (Compat) kept = select(zero < weight, alpha, zero);
-            store(scratch.alphas + int64_t(item) * kLanes, kept);
-            store(scratch.weights + int64_t(item) * kLanes, select(p16(limits.alpha_max) < raw, zero - weight, weight));
         }
     }
 
@@ -279,12 +343,12 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const
         store(behind[b], sum_);
     }
 
-    for (int64_t k = begin + n; k < end; k++) std::memset(all.sums + all.slots[k] * kSums, 0, sizeof(R) * kSums);
+    for (int64_t k = begin + n; k < end; k++) std::memset(all.sums + int64_t(all.slots[k]) * kSlot, 0, sizeof(R) * kSlot);
     for (int j = n - 1; j >= 0; j--) {
-        R* slot = all.sums + all.slots[begin + j] * kSums;
+        R* slot = all.sums + int64_t(all.slots[begin + j]) * kSlot;
         uint32_t mask = args.masks[begin + j];
         if (!mask) {
-            std::memset(slot, 0, sizeof(R) * kSums);
+            std::memset(slot, 0, sizeof(R) * kSlot);
             continue;
         }
         const TileEntry<R>& entry = scratch.entries[j];
@@ -313,8 +377,8 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const
             err = fma(ge_r, d.r, err), ers = fma(ge_r, d.s, ers), ess = fma(ge_s, d.s, ess);
             red = fma(weight, g0, red), green = fma(weight, g1, green), blue = fma(weight, g2, blue);
         }
-        const P<R> totals[kSums] = {e, er, es, err, ers, ess, red, green, blue, depth};
-        for (int q = 0; q < kSums; q++) slot[q] = sum(totals[q]);
+        const P<R> totals[kSlot] = {e, er, es, err, ers, ess, red, green, blue, depth, zero, zero};
+        sums_of_twelve(totals, slot);
     }
 }
 

@@ -10,6 +10,7 @@ constexpr int kTile = 16;    // edge of a tile in pixels
 constexpr int kBlocks = 16;  // 4x4-pixel blocks per tile, row by row
 constexpr int kLanes = 16;   // pixels per block, row by row
 constexpr int kSums = 10;    // partial sums per (tile, Gaussian)
+constexpr int kSlot = 12;    // room for them
 
 struct Camera {
     double rotation[9];  // world to camera, row by row
@@ -34,13 +35,18 @@ struct alignas(64) Record {
 };
 static_assert(sizeof(Record<float>) == 64);
 
+// The (tile, Gaussian) pairs of one Gaussian, and the rows of tiles they lie in.
+struct Span {
+    uint32_t begin, count, first_row, last_row;
+};
+
 // A record seen from one tile: the scaled distances at the centre of each block (rounded once, from float64)
 // and their spread over the 16 pixels of a block.
 template <class R>
 struct alignas(64) TileEntry {
     R spread[kLanes];
     R center_r[kBlocks];
-    R center_s[4];
+    R center_s[kBlocks];
     R sy, opacity, red, green, blue, depth;
 };
 
@@ -60,6 +66,7 @@ struct ProjectArgs {
     Record<R>* records;
     uint8_t* status;
     double* depths;
+    double* extents;  // [N, 2] px: half the width and height of the footprint
     R *means2d, *radii;
 };
 
@@ -81,9 +88,9 @@ struct TileArgs {
 template <class R>
 struct TileGradientArgs {
     TileArgs<R> tiles;
-    const int64_t* slots;              // where the sums of an entry go: contiguous per Gaussian, in tile order
+    const uint32_t* slots;             // where the sums of an entry go: contiguous per Gaussian, in tile order
     const R *v_color, *v_alpha, *v_depth;  // the last two may be null
-    R* sums;                           // [slot, kSums]
+    R* sums;                           // [slot, kSlot]
     double* v_background;              // [tile, 3]
 };
 
@@ -102,8 +109,7 @@ struct GeometryGradientArgs {
     Inputs<R> in;
     const uint8_t* status;
     const Record<R>* records;
-    const int64_t* pair_begin;  // per Gaussian
-    const int64_t* pair_count;
+    const Span* spans;          // per Gaussian
     const R* sums;
     R *v_means, *v_quats, *v_log_scales, *v_opacities, *v_colors, *v_offset;  // v_offset may be null
 };
