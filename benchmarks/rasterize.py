@@ -165,7 +165,10 @@ def main() -> None:
                     medians = {who: statistics.median(values) for who, values in times.items()}
                     ratio = medians["ours"] / medians["yardstick"] if "yardstick" in medians else None
                     memory = peak_mb(options.yardstick, count, size) if name == "forward_backward" else None
-                    cells = [f"{medians[who]:.1f} ({min(times[who]):.1f})" if who in times else "" for who in ("ours", "yardstick")]
+                    cells = [
+                        f"{medians[who]:.1f} ({min(times[who]):.1f})" if who in times else ""
+                        for who in ("ours", "yardstick")
+                    ]
                     print(
                         f"{count // 1000:>4}k/{size:<4} {threads:>3}  {name:<26} {cells[0]:>15}  {cells[1]:>15}  "
                         f"{'' if ratio is None else f'{ratio:.2f}':>6}  {'' if memory is None else f'{memory:.0f}':>7}",
