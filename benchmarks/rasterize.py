@@ -5,8 +5,9 @@
 
 DIR holds `bench_scene.py` with `make_scene(n)`, `camera(size)` and `target_image(height, width)`, and optionally
 `limit_kernel.py` with a class `LimitKernel(scene, camera)` that has `forward()` and `fwd_bwd(target)`: the yardstick,
-built when first used. Ours goes through the PyTorch function with its argument checks and gives colour, alpha and depth;
-both take the sign of the difference to the target as upstream. They are timed in turn, so that a busy neighbour hits both.
+built when first used. Ours goes through the PyTorch function with its argument checks and gives colour, alpha and
+depth; both take the sign of the difference to the target as upstream. They are timed in turn, so that a busy neighbour
+hits both.
 
 Prints median (minimum) in ms, the ratio of the medians, and the memory that one forward + backward takes at its peak.
 `--oracle` adds the plain torch oracle (slow).
