@@ -22,6 +22,9 @@ BLUR: Final = 0.3
 # Near plane in normalised units (the scene is about 1 across), never an absolute length.
 NEAR: Final = 0.01
 
+# A Gaussian farther away or larger than this is counted as non-finite: its gradients would leave float32.
+FAR: Final = 1e30
+
 # x/z and y/z are clamped to the image border plus this share of the half field of view before the
 # Jacobian is taken: the affine approximation of the projection has no meaning far outside (3DGS).
 FRUSTUM_MARGIN: Final = 0.3

@@ -100,6 +100,7 @@ class _Rasterize(torch.autograd.Function):
             settings.alpha_max,
             settings.blur,
             settings.near,
+            settings.far,
             settings.frustum_margin,
             settings.compat,
             color,

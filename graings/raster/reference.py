@@ -102,7 +102,8 @@ def _cull(
     """Indices of what is drawn and the reasons for the rest; each Gaussian is counted at its first reason."""
     everything = torch.cat([means, quats, log_scales, opacities[:, None], colors, offset], 1)
     squared = (quats * quats).sum(1)
-    finite = everything.isfinite().all(1) & squared.isfinite()
+    largest = torch.cat([log_scales.exp(), _in_camera(means, camera)[:, 2:].abs()], 1).amax(1)
+    finite = everything.isfinite().all(1) & squared.isfinite() & (largest <= settings.far)
     turned = squared >= MIN_SQUARED_QUAT
     in_front = _in_camera(means, camera)[:, 2] > settings.near
     visible = opacities > settings.alpha_min

@@ -27,6 +27,7 @@ class RasterSettings:
     alpha_max: float = constants.ALPHA_MAX
     blur: float = constants.BLUR
     near: float = constants.NEAR
+    far: float = constants.FAR
     frustum_margin: float = constants.FRUSTUM_MARGIN
     compat: bool = False
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from graings.config import SceneConfig
@@ -38,11 +38,14 @@ class CanonicalAppearance(nn.Module):
             last.bias.fill_(math.atanh(initial_opacity))
 
     def colors(
-        self, features: Float[Tensor, "anchor feature"], directions: Float[Tensor, "anchor 3"]
-    ) -> Float[Tensor, "anchor child 3"]:
-        """c_can of every child slot."""
+        self,
+        features: Float[Tensor, "anchor feature"],
+        directions: Float[Tensor, "anchor 3"],
+        children: Int64[Tensor, " drawn"],
+    ) -> Float[Tensor, "drawn 3"]:
+        """c_can of the given flat child slots (anchor * k + child)."""
         raw = perceptron(torch.cat([features, directions], dim=-1), *weights_and_biases(self.color))
-        return raw.sigmoid().unflatten(-1, (-1, 3))
+        return raw.view(-1, 3).index_select(0, children).sigmoid()
 
     def opacity_logits(
         self, features: Float[Tensor, "anchor feature"], directions: Float[Tensor, "anchor 3"]
@@ -53,7 +56,10 @@ class CanonicalAppearance(nn.Module):
 
 
 class ResidualField(nn.Module):
-    """F_res: (f_a, gamma(t)) -> (Delta c, Delta o) per child slot, bounded by eta, Eq. 12; zero at birth."""
+    """F_res: (f_a, gamma(t)) -> (Delta c, Delta o) per child slot, Eq. 12; zero at birth.
+
+    What `forward` gives is still to be bounded by `bounded`: few slots are drawn, and only they need all of it.
+    """
 
     def __init__(self, config: SceneConfig) -> None:
         super().__init__()
@@ -67,10 +73,13 @@ class ResidualField(nn.Module):
 
     def forward(
         self, features: Float[Tensor, "anchor feature"], time: Float[Tensor, 1]
-    ) -> tuple[Float[Tensor, "anchor child 3"], Float[Tensor, "anchor child"]]:
-        """(Delta c, Delta o) at `time` in [0, 1]."""
+    ) -> Float[Tensor, "anchor child 4"]:
+        """(Delta c, Delta o) of every slot at `time` in [0, 1], unbounded."""
         moment = self.from_time(frequency_encoding(time, self.time_frequencies))
         biases = [self.from_feature.bias + moment, self.out.bias]
         change = perceptron(features, [self.from_feature.weight, self.out.weight], biases)
-        raw = self.scale * torch.tanh(change).unflatten(-1, (-1, 4))
-        return raw[..., :3], raw[..., 3]
+        return change.unflatten(-1, (-1, 4))
+
+    def bounded(self, raw: Float[Tensor, "*rows"]) -> Float[Tensor, "*rows"]:
+        """`raw` within (-eta, eta)."""
+        return self.scale * torch.tanh(raw)

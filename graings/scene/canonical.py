@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from graings.config import SceneConfig
 from graings.scene.perceptron import perceptron
@@ -18,16 +17,6 @@ from graings.scene.perceptron import perceptron
 # A child starts with about half the spacing of its neighbours as standard deviation: they overlap, but
 # none hides the next (decision 12).
 INITIAL_SCALE = 0.5
-
-
-def one_hot(slots: Int64[Tensor, " drawn"], codes: Float[Tensor, "child width"]) -> Float[Tensor, "drawn child"]:
-    """A one in the column of each child's slot: what picks its code in a first layer."""
-    return torch.eye(len(codes), dtype=codes.dtype, device=codes.device).index_select(0, slots)
-
-
-def identity_quaternion(like: Tensor) -> Tensor:
-    """(1, 0, 0, 0) in the dtype of `like`."""
-    return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=like.dtype, device=like.device)
 
 
 class StaticMLP(nn.Module):
@@ -50,21 +39,14 @@ class StaticMLP(nn.Module):
             self.out.bias.zero_()
             self.out.bias[4:] = math.log(INITIAL_SCALE)
 
-    def forward(
-        self,
-        features: Float[Tensor, "anchor feature"],
-        offsets: Float[Tensor, "drawn 3"],
-        owners: Int64[Tensor, " drawn"],
-        slots: Int64[Tensor, " drawn"],
-    ) -> tuple[Float[Tensor, "drawn 4"], Float[Tensor, "drawn 3"]]:
-        """Unit quaternions (w, x, y, z) and log-scales relative to log s_a of the drawn children."""
+    def forward(self, inputs: Float[Tensor, "drawn width"]) -> Float[Tensor, "drawn 7"]:
+        """Quaternion less the identity and log-scale less log s_a, from `Children.inputs`."""
         first = torch.cat([self.from_feature.weight, self.from_offset.weight, self.child_bias.t()], dim=1)
-        inputs = torch.cat([features.index_select(0, owners), offsets, one_hot(slots, self.child_bias)], dim=1)
-        raw = perceptron(inputs, [first, self.out.weight], [self.from_feature.bias, self.out.bias])
-        return canonical_attributes(raw)
+        return perceptron(inputs, [first, self.out.weight], [self.from_feature.bias, self.out.bias])
 
 
-def canonical_attributes(raw: Float[Tensor, "drawn 7"]) -> tuple[Float[Tensor, "drawn 4"], Float[Tensor, "drawn 3"]]:
-    """Network output to (unit quaternion, relative log-scale): the identity rotation is the origin."""
-    quats = raw[:, :4] + identity_quaternion(raw)
-    return functional.normalize(quats, dim=-1, eps=1e-12), raw[:, 4:]
+def unlearned(children: Float[Tensor, "drawn 3"]) -> Float[Tensor, "drawn 7"]:
+    """What StaticMLP's answer is where there is none: no rotation, the initial scale."""
+    answer = children.new_zeros(len(children), 7)
+    answer[:, 4:] = math.log(INITIAL_SCALE)
+    return answer

@@ -1,4 +1,4 @@
-"""DeformationNetwork: an offset in time for each Gaussian (Eq. 7), and how it is applied (Eq. 10).
+"""DeformationNetwork: an offset in time for each Gaussian (Eq. 7).
 
 Knows nothing of anchors, appearance, cameras or pixels. Whether its positions are detached is the scene's
 decision, not this module's.
@@ -14,13 +14,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from graings.config import SceneConfig
-from graings.scene.canonical import INITIAL_SCALE, identity_quaternion, one_hot
-from graings.scene.clip import clip
+from graings.scene.canonical import INITIAL_SCALE
 from graings.scene.encoding import encoding_width, frequency_encoding
 from graings.scene.perceptron import perceptron, weights_and_biases
-
-# Bound on the change of a log-scale in time (Eq. 10).
-LOG_SCALE_BOUND = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,38 +31,10 @@ class Deformation:
     rotation: Float[Tensor, "gaussian 4"]
     log_scales: Float[Tensor, "gaussian 3"]
 
-    def apply(
-        self,
-        means: Float[Tensor, "gaussian 3"],
-        quats: Float[Tensor, "gaussian 4"],
-        log_scales: Float[Tensor, "gaussian 3"],
-        *,
-        projected_clip: bool,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Deformed (means, quats, log_scales), Eq. 10."""
-        bounded = clip(self.log_scales, -LOG_SCALE_BOUND, LOG_SCALE_BOUND, projected=projected_clip)
-        turn = self.rotation + identity_quaternion(self.rotation)
-        return means + self.position, quaternion_product(quats, turn), log_scales + bounded
 
-
-def deformation_from(raw: Float[Tensor, "gaussian 10"], extent: Tensor) -> Deformation:
+def deformation_from(raw: Float[Tensor, "gaussian 10"], extent: float) -> Deformation:
     """Network output to offsets; positions come in units of the scene's extent, so rates need no length."""
     return Deformation(raw[:, :3] * extent, raw[:, 3:7], raw[:, 7:10])
-
-
-def quaternion_product(a: Float[Tensor, "gaussian 4"], b: Float[Tensor, "gaussian 4"]) -> Float[Tensor, "gaussian 4"]:
-    """Hamilton product of (w, x, y, z) quaternions, not normalised (the rasterizer does that once)."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        dim=-1,
-    )
 
 
 class DeformationNetwork(nn.Module):
@@ -121,18 +89,13 @@ class SingleMLP(nn.Module):
             self.out.bias[4:7] = math.log(INITIAL_SCALE)
 
     def forward(
-        self, features: Tensor, offsets: Tensor, owners: Tensor, slots: Tensor, positions: Tensor, time: Tensor | None
+        self, inputs: Float[Tensor, "gaussian width"], positions: Float[Tensor, "gaussian 3"], time: Tensor | None
     ) -> Float[Tensor, "gaussian 17"]:
-        """Raw outputs of the drawn children; arguments as in StaticMLP and DeformationNetwork."""
+        """Raw outputs of the drawn children: `Children.inputs`, and the rest as in DeformationNetwork."""
         weights = [self.from_feature.weight, self.from_offset.weight, self.child_bias.t(), self.from_position.weight]
-        inputs = [
-            features.index_select(0, owners),
-            offsets,
-            one_hot(slots, self.child_bias),
-            frequency_encoding(positions, self.position_frequencies),
-        ]
+        everything = [inputs, frequency_encoding(positions, self.position_frequencies)]
         bias = self.from_feature.bias
         if time is not None:
             bias = bias + self.from_time(frequency_encoding(time, self.time_frequencies))
         rest = weights_and_biases([*self.hidden, self.out])
-        return perceptron(torch.cat(inputs, dim=1), [torch.cat(weights, dim=1), *rest[0]], [bias, *rest[1]])
+        return perceptron(torch.cat(everything, dim=1), [torch.cat(weights, dim=1), *rest[0]], [bias, *rest[1]])

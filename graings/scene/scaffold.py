@@ -1,4 +1,4 @@
-"""Scaffold: the anchors and what each of them carries (Eq. 3), and the children's canonical centres (Eq. 4).
+"""Scaffold: the anchors and what each of them carries (Eq. 3).
 
 Knows nothing of networks, cameras, time or pixels.
 """
@@ -51,12 +51,6 @@ class Scaffold(nn.Module):
     def slots(self) -> int:
         """Child slots per anchor k."""
         return int(self.offsets.shape[1])
-
-    def centres(self, children: Int64[Tensor, " drawn"]) -> Float[Tensor, "drawn 3"]:
-        """x_can of the given flat child slots (anchor * k + child), Eq. 4."""
-        owners = children // self.slots
-        scales = self.log_scales.exp().index_select(0, owners)
-        return self.anchors.index_select(0, owners) + scales * self.offsets.flatten(0, 1).index_select(0, children)
 
     def child_uids(self, children: Int64[Tensor, " drawn"]) -> Int64[Tensor, " drawn"]:
         """Persistent birth numbers of the given flat child slots."""

@@ -7,7 +7,6 @@ or losses.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,14 +19,11 @@ from graings import constants
 from graings.config import SceneConfig
 from graings.gaussians import Gaussians
 from graings.scene.appearance import CanonicalAppearance, ResidualField
-from graings.scene.canonical import INITIAL_SCALE, StaticMLP, canonical_attributes, identity_quaternion
+from graings.scene.canonical import StaticMLP, unlearned
+from graings.scene.children import Children, compose, gather
 from graings.scene.clip import clip
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP, deformation_from
 from graings.scene.scaffold import Scaffold
-
-# Log standard deviations are kept in this range of normalised units: a factor 1e7 below and 100 above the
-# scene. Outside, exp and its square would leave float32 (numerics, 2.8).
-LOG_SCALE_RANGE = (-16.118095650958319, 4.605170185988092)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,35 +79,33 @@ class Scene(nn.Module):
             self.appearance.opacity_logits(features, directions) + scaffold.opacity_offsets.unsqueeze(-1)
         )
         change: Tensor | None = None
-        if self.temporal and self.residual is not None:
+        residual = self.residual if self.temporal else None
+        if residual is not None:
             source = features.detach() if config.residual_stop_gradient else features
-            color_change, score_change = self.residual(source, moment)
-            scores = scores + score_change
-            change = torch.cat([color_change, score_change.unsqueeze(-1)], dim=-1).flatten(0, 1)
+            change = residual(source, moment)
+            scores = scores + residual.bounded(change[..., 3])
 
         children = (scores.detach().flatten() > constants.ALPHA_MIN).nonzero().squeeze(-1)
-        colors = self.appearance.colors(features, directions).flatten(0, 1).index_select(0, children)
+        colors = self.appearance.colors(features, directions, children)
         drawn_change = None
-        if change is not None:
-            drawn_change = change.index_select(0, children)
+        if residual is not None and change is not None:
+            drawn_change = residual.bounded(change.flatten(0, 1).index_select(0, children))
             colors = clip(colors + drawn_change[:, :3], 0.0, 1.0, projected=config.projected_clip)
 
-        canonical_means = scaffold.centres(children)
-        quats, log_scales, deformation = self._geometry(children, canonical_means, time)
-        means = canonical_means
-        if deformation is not None:
-            means, quats, log_scales = deformation.apply(
-                canonical_means, quats, log_scales, projected_clip=config.projected_clip
-            )
+        drawn = gather(scaffold, children)
+        canonical, raw = self._answers(drawn, children, time)
+        extent = float(self.extent)
+        means, quats, log_scales = compose(canonical, drawn, raw, extent, projected_clip=config.projected_clip)
         gaussians = Gaussians(
             means=means,
             quats=quats,
-            log_scales=clip(log_scales, *LOG_SCALE_RANGE, projected=config.projected_clip),
+            log_scales=log_scales,
             opacities=scores.flatten().index_select(0, children),
             colors=colors,
             uids=scaffold.child_uids(children),
         )
-        return Composition(gaussians, children, canonical_means, deformation, drawn_change, scores.detach())
+        moved = None if raw is None else deformation_from(raw, extent)
+        return Composition(gaussians, children, drawn.centres, moved, drawn_change, scores.detach())
 
     def directions(self, eye: ArrayLike) -> Float[Tensor, "anchor 3"]:
         """Unit vectors from the camera centre to every anchor (decision A21)."""
@@ -122,52 +116,43 @@ class Scene(nn.Module):
     def deform(
         self, children: Int64[Tensor, " gaussian"], canonical_means: Float[Tensor, "gaussian 3"], time: float
     ) -> Deformation | None:
-        """Offsets at `time` of drawn children (flat slots) with the canonical positions given, Eq. 7.
+        """Offsets at `time` of drawn children (flat slots, ascending) with the canonical positions given, Eq. 7.
 
         None while the scene is static. The gradient is stopped, or not, as the configuration says.
         """
         if not self.temporal or (self.deformation is None and self.single is None):
             return None
-        moment = torch.tensor([time], dtype=canonical_means.dtype)
-        positions = (canonical_means.detach() if self.config.stop_gradient else canonical_means) / self.extent
-        owners = children // self.scaffold.slots
         if self.single is not None:
-            raw = self._single(self.single, children, positions, moment)[:, 7:]
-        elif self.deformation is not None and self.config.deformation == "anchor":
-            used, place = torch.unique(owners, return_inverse=True)
-            anchors = self.scaffold.anchors.index_select(0, used) / self.extent
-            raw = self.deformation(anchors, moment).index_select(0, place)
+            raw = self._single(self.single, gather(self.scaffold, children).inputs, canonical_means, time)[:, 7:]
         else:
-            assert self.deformation is not None
-            raw = self.deformation(positions, moment)
-        return deformation_from(raw, self.extent)
+            raw = self._moved(children, canonical_means, time)
+        return deformation_from(raw, float(self.extent))
 
-    def _single(self, single: SingleMLP, children: Tensor, positions: Tensor, moment: Tensor | None) -> Tensor:
-        k = self.scaffold.slots
-        offsets = self.scaffold.offsets.flatten(0, 1).index_select(0, children)
-        raw: Tensor = single(self.scaffold.features, offsets, children // k, children % k, positions, moment)
+    def _answers(self, drawn: Children, children: Tensor, time: float) -> tuple[Tensor, Tensor | None]:
+        """What the networks say of the drawn children: canonical geometry, and its change unless nothing moves."""
+        if self.single is not None:
+            raw = self._single(self.single, drawn.inputs, drawn.centres, time if self.temporal else None)
+            return raw[:, :7], raw[:, 7:] if self.temporal else None
+        canonical = unlearned(drawn.centres) if self.static is None else self.static(drawn.inputs)
+        moves = self.temporal and self.deformation is not None
+        return canonical, self._moved(children, drawn.centres, time) if moves else None
+
+    def _moved(self, children: Tensor, canonical_means: Tensor, time: float) -> Tensor:
+        """DeformNet's answer per child, or one per anchor that all its children share."""
+        assert self.deformation is not None
+        moment = torch.tensor([time], dtype=canonical_means.dtype)
+        if self.config.deformation == "anchor":
+            used, place = torch.unique(children // self.scaffold.slots, return_inverse=True)
+            shared: Tensor = self.deformation(self.scaffold.anchors.index_select(0, used) / self.extent, moment)
+            return shared.index_select(0, place)
+        own: Tensor = self.deformation(self._positions(canonical_means), moment)
+        return own
+
+    def _single(self, single: SingleMLP, inputs: Tensor, canonical_means: Tensor, time: float | None) -> Tensor:
+        moment = None if time is None else torch.tensor([time], dtype=inputs.dtype)
+        raw: Tensor = single(inputs, self._positions(canonical_means), moment)
         return raw
 
-    def _canonical(self, children: Tensor) -> tuple[Tensor, Tensor]:
-        """(quats, log_scales) of the drawn children before any deformation, Eq. 5."""
-        scaffold = self.scaffold
-        owners, slots = children // scaffold.slots, children % scaffold.slots
-        base = scaffold.log_scales.index_select(0, owners)
-        if self.static is None:
-            return identity_quaternion(base).expand(len(children), 4), base + math.log(INITIAL_SCALE)
-        offsets = scaffold.offsets.flatten(0, 1).index_select(0, children)
-        quats, relative = self.static(scaffold.features, offsets, owners, slots)
-        return quats, base + relative
-
-    def _geometry(
-        self, children: Tensor, canonical_means: Tensor, time: float
-    ) -> tuple[Tensor, Tensor, Deformation | None]:
-        """(canonical quats, canonical log_scales, deformation) of the drawn children."""
-        if self.single is None:
-            return *self._canonical(children), self.deform(children, canonical_means, time)
-        positions = (canonical_means.detach() if self.config.stop_gradient else canonical_means) / self.extent
-        moment = torch.tensor([time], dtype=positions.dtype) if self.temporal else None
-        raw = self._single(self.single, children, positions, moment)
-        quats, relative = canonical_attributes(raw[:, :7])
-        base = self.scaffold.log_scales.index_select(0, children // self.scaffold.slots)
-        return quats, base + relative, deformation_from(raw[:, 7:], self.extent) if self.temporal else None
+    def _positions(self, canonical_means: Tensor) -> Tensor:
+        """Where a deformation network sees the children: in units of the extent, as a constant if so configured."""
+        return (canonical_means.detach() if self.config.stop_gradient else canonical_means) / self.extent

@@ -72,12 +72,11 @@ class DensityStatistics:
         seen = children[visible]
         self.gradient.view(-1).index_add_(0, seen, norms[visible])
         self.drawn.view(-1).index_add_(0, seen, torch.ones_like(seen))
-        owners = torch.unique(seen // opacities.shape[1])
         # An anchor without a drawn child is seen too: its opacity is what pruning wants to know.
-        hidden = opacities.amax(dim=-1) <= constants.ALPHA_MIN
-        hidden[owners] = True
-        self.visits += hidden
-        self.opacity += opacities.clamp_min(0).sum(-1).double() * hidden
+        visited = opacities.amax(dim=-1) <= constants.ALPHA_MIN
+        visited[seen // opacities.shape[1]] = True
+        self.visits += visited
+        self.opacity += opacities.clamp_min(0).sum(-1).double() * visited
 
     def resize(self, keep: Bool[Tensor, " anchor"] | None = None, append: int = 0) -> None:
         """Follow the scaffold: drop rows outside `keep`, then add `append` empty ones."""

@@ -169,7 +169,7 @@ class Trainer:
         there = here + side if 0 <= here + side < len(self.times) else here - side
         count = len(composition.children)
         size = min(count, max(MIN_TEMPORAL_SAMPLE, int(self.config.loss.temporal_share * count)))
-        sample = torch.randperm(count, generator=generator)[:size]
+        sample = torch.randperm(count, generator=generator)[:size].sort().values
         neighbour = self.scene.deform(
             composition.children[sample], composition.canonical_means[sample], float(self.times[there])
         )

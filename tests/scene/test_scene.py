@@ -9,19 +9,8 @@ import torch
 
 from graings import constants
 from graings.scene.clip import clip
-from graings.scene.deformation import Deformation, quaternion_product
 from graings.scene.encoding import encoding_width, frequency_encoding
 from tests.models import EYE, tiny_scene
-
-
-def test_child_centres_follow_anchor_scale_and_offset() -> None:
-    scaffold = tiny_scene().scaffold
-    children = torch.tensor([0, 4, 59])
-    centres = scaffold.centres(children)
-    for row, child in zip(centres, children.tolist(), strict=True):
-        anchor, slot = divmod(child, 3)
-        expected = scaffold.anchors[anchor] + scaffold.log_scales[anchor].exp() * scaffold.offsets[anchor, slot]
-        assert torch.equal(row, expected)
 
 
 def test_untrained_deformation_and_residual_are_identity() -> None:
@@ -148,18 +137,6 @@ def test_temporal_pair_reuses_the_same_network() -> None:
     composition = scene.compose(EYE, 0.4)
     again = scene.deform(composition.children, composition.canonical_means, 0.4)
     assert torch.equal(again.position, composition.deformation.position)
-
-
-def test_quaternion_product_is_rotation_after_rotation() -> None:
-    half = math.sqrt(0.5)
-    about_x, about_y = torch.tensor([[half, half, 0, 0]]), torch.tensor([[half, 0, half, 0]])
-    assert torch.allclose(quaternion_product(about_x, about_y), torch.tensor([[0.5, 0.5, 0.5, 0.5]]), atol=1e-7)
-
-
-def test_log_scale_change_is_clipped_at_two() -> None:
-    moved = Deformation(torch.zeros(2, 3), torch.zeros(2, 4), torch.tensor([[3.0, 0.5, -9.0], [0.0, 0.0, 0.0]]))
-    _, _, log_scales = moved.apply(torch.zeros(2, 3), torch.ones(2, 4), torch.zeros(2, 3), projected_clip=True)
-    assert torch.equal(log_scales[0], torch.tensor([2.0, 0.5, -2.0]))
 
 
 def test_projected_clip_passes_only_gradients_that_point_back_inside() -> None:

@@ -14,6 +14,7 @@
 #include <malloc.h>
 #endif
 
+#include "children.hpp"
 #include "frame.hpp"
 #include "isa.hpp"
 #include "network.hpp"
@@ -63,6 +64,62 @@ graings::Network<R> network(const In<R>& input, int64_t rows, const std::vector<
 }
 
 template <class R>
+graings::Anchors<R> anchors(const In<R>& feature, const In<R>& place, const In<R>& log_scale, const In<R>& offset) {
+    const size_t count = feature.shape(0), slots = offset.shape(1);
+    return {int64_t(count), int64_t(slots), int64_t(feature.shape(1)), feature.data(), checked(place, 3 * count, "anchors"),
+            checked(log_scale, 3 * count, "log_scales"), checked(offset, 3 * count * slots, "offsets")};
+}
+
+template <class R>
+graings::Answers<R> answers(const In<R>& canonical, const In<R>& base, const In<R>& centre, const std::optional<In<R>>& moved, double extent, double change,
+                            double low, double high, bool projected) {
+    const size_t drawn = base.shape(0);
+    return {int64_t(drawn), checked(canonical, 7 * drawn, "canonical"), checked(base, 3 * drawn, "base"), checked(centre, 3 * drawn, "centre"),
+            checked(moved, 10 * drawn, "moved"), extent, {change, low, high, projected}};
+}
+
+template <class R>
+void bind_children(nb::module_& m) {
+    m.def("gather", [](In<R> feature, In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, Out<R> row, Out<R> centre, Out<R> base, int threads) {
+        const auto from = anchors<R>(feature, place, log_scale, offset);
+        const size_t drawn = children.size();
+        R *rows = checked(row, drawn * size_t(from.features + 3 + from.slots), "row"), *centres = checked(centre, 3 * drawn, "centre");
+        R* bases = checked(base, 3 * drawn, "base");
+        nb::gil_scoped_release release;
+        graings::gather<R>(from, int64_t(drawn), children.data(), rows, centres, bases, threads);
+    });
+    m.def("gather_gradient", [](In<R> feature, In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, In<R> v_row, In<R> v_centre, In<R> v_base,
+                                Out<R> v_feature, Out<R> v_log_scale, Out<R> v_offset, int threads) {
+        const auto from = anchors<R>(feature, place, log_scale, offset);
+        const size_t drawn = children.size();
+        const R *row = checked(v_row, drawn * size_t(from.features + 3 + from.slots), "v_row"), *centre = checked(v_centre, 3 * drawn, "v_centre");
+        const R* base = checked(v_base, 3 * drawn, "v_base");
+        R *features = checked(v_feature, feature.size(), "v_feature"), *scales = checked(v_log_scale, log_scale.size(), "v_log_scale");
+        R* offsets = checked(v_offset, offset.size(), "v_offset");
+        nb::gil_scoped_release release;
+        graings::gather_gradient<R>(from, int64_t(drawn), children.data(), row, centre, base, features, scales, offsets, threads);
+    });
+    m.def("compose", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> moved, double extent, double change, double low, double high, bool projected,
+                        Out<R> mean, Out<R> quat, Out<R> log_scale, int threads) {
+        const auto in = answers<R>(canonical, base, centre, moved, extent, change, low, high, projected);
+        const size_t drawn = size_t(in.drawn);
+        R *means = checked(mean, 3 * drawn, "mean"), *quats = checked(quat, 4 * drawn, "quat"), *scales = checked(log_scale, 3 * drawn, "log_scale");
+        nb::gil_scoped_release release;
+        graings::compose<R>(in, means, quats, scales, threads);
+    });
+    m.def("compose_gradient", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> moved, double extent, double change, double low, double high,
+                                 bool projected, In<R> v_mean, In<R> v_quat, In<R> v_log_scale, Out<R> v_canonical, std::optional<Out<R>> v_moved, int threads) {
+        const auto in = answers<R>(canonical, base, centre, moved, extent, change, low, high, projected);
+        const size_t drawn = size_t(in.drawn);
+        const R *means = checked(v_mean, 3 * drawn, "v_mean"), *quats = checked(v_quat, 4 * drawn, "v_quat"), *scales = checked(v_log_scale, 3 * drawn, "v_log_scale");
+        R *out = checked(v_canonical, 7 * drawn, "v_canonical"), *out_moved = checked(v_moved, 10 * drawn, "v_moved");
+        if (bool(out_moved) != bool(in.moved)) throw std::invalid_argument("moved and its gradient belong together");
+        nb::gil_scoped_release release;
+        graings::compose_gradient<R>(in, means, quats, scales, out, out_moved, threads);
+    });
+}
+
+template <class R>
 void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
     using graings::Frame;
     nb::class_<Frame<R>>(m, frame_name)
@@ -72,7 +129,14 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
             for (int i = 0; i < 5; i++) counts[names[i]] = frame.statuses()[graings::kNonFinite + i];
             return counts;
         })
+        .def_prop_ro("seconds", [](const Frame<R>& frame) {
+            nb::dict stages;
+            const char* names[] = {"project", "sort", "bin", "blend", "blend gradient", "geometry gradient"};
+            for (int i = 0; i < graings::kStages; i++) stages[names[i]] = frame.seconds()[i];
+            return stages;
+        }, "of each stage")
         .def_prop_ro("pairs", &Frame<R>::pairs, "(tile, Gaussian) pairs")
+        .def_prop_ro("evaluated", &Frame<R>::evaluated, "(pixel, Gaussian) pairs that were looked at")
         .def("gradient",
              [](const Frame<R>& frame, In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, std::optional<In<R>> offset, In<R> background,
                 int64_t height, int64_t width, In<R> v_color, std::optional<In<R>> v_alpha, std::optional<In<R>> v_depth, Out<R> g_means, Out<R> g_quats, Out<R> g_log_scales,
@@ -92,14 +156,14 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
     m.def(draw_name,
           [](In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, std::optional<In<R>> offset, In<R> background, In<int64_t> uids,
              In<double> rotation, In<double> center, double fx, double fy, double cx, double cy, int64_t width, int64_t height, double alpha_min,
-             double transmittance_min, double alpha_max, double blur, double near, double frustum_margin, bool compat, Out<R> color, Out<R> alpha,
+             double transmittance_min, double alpha_max, double blur, double near, double far, double frustum_margin, bool compat, Out<R> color, Out<R> alpha,
              Out<R> depth, Out<R> means2d, Out<R> radii, int threads) {
               const auto in = inputs<R>(means, quats, log_scales, opacities, colors, offset, background);
               const size_t n = size_t(in.count), pixels = size_t(height * width);
               graings::Camera camera{{}, {}, fx, fy, cx, cy, width, height};
               std::copy_n(checked(rotation, 9, "rotation"), 9, camera.rotation);
               std::copy_n(checked(center, 3, "center"), 3, camera.center);
-              const graings::Settings settings{alpha_min, transmittance_min, alpha_max, blur, near, frustum_margin, compat};
+              const graings::Settings settings{alpha_min, transmittance_min, alpha_max, blur, near, far, frustum_margin, compat};
               const graings::Outputs<R> out{checked(color, 3 * pixels, "color"), checked(alpha, pixels, "alpha"), checked(depth, pixels, "depth"),
                                             checked(means2d, 2 * n, "means2d"), checked(radii, 2 * n, "radii")};
               const int64_t* ties = checked(uids, n, "uids");
@@ -148,6 +212,8 @@ NB_MODULE(_kernel, m) {
     m.doc() = "Compiled rasterizer; use graings.raster.rasterize and graings.raster.photometric.";
     bind<float>(m, "FrameFloat", "draw_float");
     bind<double>(m, "FrameDouble", "draw_double");
+    bind_children<float>(m);
+    bind_children<double>(m);
     m.def("hidden_size", &graings::hidden_size, "widths"_a, "rows"_a, "Elements that a network's hidden activations take.");
     m.def("keep_freed_memory", [] {
 #ifdef __GLIBC__

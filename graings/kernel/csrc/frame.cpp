@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <bit>
+#include <chrono>
 #include <cmath>
 #include <limits>
 #include <numeric>
@@ -15,6 +16,18 @@
 namespace graings {
 
 namespace {
+
+// Seconds since the last lap.
+class Stopwatch {
+public:
+    double lap() {
+        const auto now = std::chrono::steady_clock::now();
+        return std::chrono::duration<double>(now - std::exchange(last_, now)).count();
+    }
+
+private:
+    std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
+};
 
 constexpr int64_t kPiece = 512;  // Gaussians handed to a thread at a time
 
@@ -74,11 +87,16 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
       tiles_(pieces_of(camera.width, kTile) * pieces_of(camera.height, kTile)), status_(size_t(in.count)),
       records_(size_t(in.count)), spans_(size_t(in.count)) {
     if (count_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::invalid_argument("more than 2^32 Gaussians");
+    Stopwatch watch;
     Buffer<double> depths{size_t(count_)}, extents{2 * size_t(count_)};
     std::vector<std::vector<uint32_t>> lists{size_t(pieces_of(count_, kPiece))};
     std::vector<int64_t> counts(size_t(tiles_), 0);
     project({camera_, settings_, in, records_.get(), status_.get(), depths.get(), extents.get(), out.means2d, out.radii}, lists, counts, threads);
-    bin(sorted(depths.get(), uids), lists, counts, threads);
+    seconds_[kProject] = watch.lap();
+    const auto order = sorted(depths.get(), uids, threads);
+    seconds_[kSort] = watch.lap();
+    bin(order, lists, counts, threads);
+    seconds_[kBin] = watch.lap();
 
     const Kernels<R>& run = kernels<R>();
     processed_ = Buffer<int32_t>(size_t(tiles_)), items_ = Buffer<int32_t>(size_t(tiles_));
@@ -86,6 +104,7 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
     tiles.color = out.color, tiles.alpha = out.alpha, tiles.depth = out.depth;
     Buffer<TileEntry<R>> chunks(size_t(threads) * kChunk);
     parallel_for(threads, tiles_, [&](int worker, int64_t tile) { run.draw_tile(tiles, tile, chunks.get() + worker * kChunk); });
+    seconds_[kBlend] = watch.lap();
 }
 
 // Records, and for each piece of Gaussians one list of the tiles they touch; `counts` of them per tile.
@@ -118,49 +137,74 @@ void Frame<R>::project(const ProjectArgs<R>& args, std::vector<std::vector<uint3
 // Visible Gaussians by (depth, uid): a radix sort on the leading bits of the depth range, then the few runs that
 // agree in them by comparison.
 template <class R>
-std::vector<uint32_t> Frame<R>::sorted(const double* depths, const int64_t* uids) {
-    struct Key { uint32_t key, id; };
+std::vector<DepthKey> Frame<R>::sorted(const double* depths, const int64_t* uids, int threads) {
+    constexpr int kDigit = 11, kPasses = 2, kBins = 1 << kDigit;
+    constexpr int64_t kWorthwhile = 8192;  // fewer are sorted faster than a thread wakes
+    const int64_t parts = std::clamp<int64_t>(count_ / kWorthwhile, 1, threads);
+    const auto begin = [&](int64_t total, int64_t part) { return total * part / parts; };
+    struct Tally {
+        int64_t statuses[kStatuses] = {};
+        uint64_t least = ~uint64_t(0), most = 0;
+    };
+    std::vector<Tally> tallies{size_t(parts)};
+    const auto bits = [&](int64_t i) { return std::bit_cast<uint64_t>(depths[i]); };  // positive: ordered like the numbers
+    parallel_for(threads, parts, [&](int, int64_t part) {
+        Tally mine;
+        for (int64_t i = begin(count_, part); i < begin(count_, part + 1); i++) {
+            mine.statuses[status_[size_t(i)]]++;
+            if (status_[size_t(i)] == kDrawn) mine.least = std::min(mine.least, bits(i)), mine.most = std::max(mine.most, bits(i));
+        }
+        tallies[size_t(part)] = mine;
+    });
     uint64_t least = ~uint64_t(0), most = 0;
-    size_t visible = 0;
-    for (int64_t i = 0; i < count_; i++) {
-        statuses_[status_[size_t(i)]]++;
-        if (status_[size_t(i)] != kDrawn) continue;
-        const uint64_t bits = std::bit_cast<uint64_t>(depths[i]);  // positive: ordered like the numbers
-        least = std::min(least, bits), most = std::max(most, bits), visible++;
+    std::vector<int64_t> first(size_t(parts) + 1, 0);
+    for (int64_t part = 0; part < parts; part++) {
+        const Tally& one = tallies[size_t(part)];
+        least = std::min(least, one.least), most = std::max(most, one.most);
+        for (int k = 0; k < kStatuses; k++) statuses_[k] += one.statuses[k];
+        first[size_t(part) + 1] = first[size_t(part)] + one.statuses[kDrawn];
     }
-    std::vector<Key> keys(visible), spare(visible);
-    constexpr int kDigit = 11, kPasses = 2;
+    const int64_t visible = first.back();
     const int shift = visible ? std::max(0, int(std::bit_width(most - least)) - kPasses * kDigit) : 0;
-    size_t n = 0;
-    for (int64_t i = 0; i < count_; i++)
-        if (status_[size_t(i)] == kDrawn) keys[n++] = {uint32_t((std::bit_cast<uint64_t>(depths[i]) - least) >> shift), uint32_t(i)};
+    std::vector<DepthKey> keys{size_t(visible)}, spare{size_t(visible)};
+    parallel_for(threads, parts, [&](int, int64_t part) {
+        DepthKey* to = keys.data() + first[size_t(part)];
+        for (int64_t i = begin(count_, part); i < begin(count_, part + 1); i++)
+            if (status_[size_t(i)] == kDrawn) *to++ = {uint32_t((bits(i) - least) >> shift), uint32_t(i)};
+    });
+    std::vector<uint32_t> at(size_t(parts * kBins));
     for (int pass = 0; pass < kPasses; pass++) {
-        std::vector<size_t> at(1 << kDigit, 0);
-        const auto digit = [&](const Key& k) { return (k.key >> (kDigit * pass)) & ((1 << kDigit) - 1); };
-        for (const Key& k : keys) at[digit(k)]++;
-        size_t total = 0;
-        for (size_t& start : at) start = std::exchange(total, total + start);
-        for (const Key& k : keys) spare[at[digit(k)]++] = k;
+        const auto digit = [&](const DepthKey& k) { return (k.key >> (kDigit * pass)) & (kBins - 1); };
+        parallel_for(threads, parts, [&](int, int64_t part) {
+            uint32_t* mine = at.data() + part * kBins;
+            std::fill_n(mine, kBins, 0);
+            for (int64_t i = begin(visible, part); i < begin(visible, part + 1); i++) mine[digit(keys[size_t(i)])]++;
+        });
+        uint32_t total = 0;
+        for (int bin = 0; bin < kBins; bin++)
+            for (int64_t part = 0; part < parts; part++) total += std::exchange(at[size_t(part * kBins + bin)], total);
+        parallel_for(threads, parts, [&](int, int64_t part) {
+            uint32_t* mine = at.data() + part * kBins;
+            for (int64_t i = begin(visible, part); i < begin(visible, part + 1); i++) spare[mine[digit(keys[size_t(i)])]++] = keys[size_t(i)];
+        });
         keys.swap(spare);
     }
-    const auto before = [&](const Key& a, const Key& b) {
+    const auto before = [&](const DepthKey& a, const DepthKey& b) {
         return std::tuple(depths[a.id], uids[a.id], a.id) < std::tuple(depths[b.id], uids[b.id], b.id);
     };
-    for (size_t i = 0; i < visible;) {
-        size_t j = i + 1;
-        while (j < visible && keys[j].key == keys[i].key) j++;
-        if (j > i + 1) std::sort(keys.begin() + std::ptrdiff_t(i), keys.begin() + std::ptrdiff_t(j), before);
+    for (int64_t i = 0; i < visible;) {
+        int64_t j = i + 1;
+        while (j < visible && keys[size_t(j)].key == keys[size_t(i)].key) j++;
+        if (j > i + 1) std::sort(keys.begin() + i, keys.begin() + j, before);
         i = j;
     }
-    std::vector<uint32_t> order(visible);
-    std::transform(keys.begin(), keys.end(), order.begin(), [](const Key& k) { return k.id; });
-    return order;
+    return keys;
 }
 
 // Every tile's entries in depth order. Threads take bands of tiles and walk all Gaussians, so that none waits for
 // another; slots follow the Gaussians' own order, so that their sums are read back in sequence.
 template <class R>
-void Frame<R>::bin(const std::vector<uint32_t>& order, const std::vector<std::vector<uint32_t>>& lists, const std::vector<int64_t>& counts, int threads) {
+void Frame<R>::bin(const std::vector<DepthKey>& order, const std::vector<std::vector<uint32_t>>& lists, const std::vector<int64_t>& counts, int threads) {
     std::vector<int64_t> base(lists.size() + 1, 0);
     for (size_t piece = 0; piece < lists.size(); piece++) base[piece + 1] = base[piece] + int64_t(lists[piece].size());
     pairs_ = base.back();
@@ -179,8 +223,8 @@ void Frame<R>::bin(const std::vector<uint32_t>& order, const std::vector<std::ve
         const int64_t first = edges[size_t(band)], last = edges[size_t(band) + 1] - 1;
         std::vector<int64_t> cursor(begin_.get() + first * across, begin_.get() + (last + 1) * across);
         for (size_t k = 0; k < order.size(); k++) {
-            if (k + 16 < order.size()) __builtin_prefetch(&spans_[order[k + 16]]);
-            const uint32_t id = order[k];
+            if (k + 16 < order.size()) __builtin_prefetch(&spans_[order[k + 16].id]);
+            const uint32_t id = order[k].id;
             const Span& span = spans_[id];
             if (int64_t(span.last_row) < first || int64_t(span.first_row) > last) continue;
             const size_t piece = id / kPiece;
@@ -203,9 +247,15 @@ TileArgs<R> Frame<R>::tile_args(const R* background) const {
 }
 
 template <class R>
+int64_t Frame<R>::evaluated() const {
+    return std::accumulate(items_.get(), items_.get() + tiles_, int64_t(0)) * kLanes;
+}
+
+template <class R>
 void Frame<R>::gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha, const R* v_depth, const Gradients<R>& out, int threads) const {
     if (in.count != count_) throw std::invalid_argument("the gradient needs the Gaussians of the forward pass");
     const Kernels<R>& run = kernels<R>();
+    Stopwatch watch;
     int64_t entries = 0, items = 0;
     for (int64_t tile = 0; tile < tiles_; tile++)
         entries = std::max<int64_t>(entries, processed_[size_t(tile)]), items = std::max<int64_t>(items, items_[size_t(tile)]);
@@ -228,11 +278,13 @@ void Frame<R>::gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha,
     for (int64_t tile = 0; tile < tiles_; tile++)
         for (int c = 0; c < 3; c++) ground[c] += v_background[size_t(3 * tile + c)];
     for (int c = 0; c < 3; c++) out.background[c] = R(ground[c]);
+    seconds_[kBlendGradient] = watch.lap();
     const GeometryGradientArgs<R> geometry{camera_, settings_, in, status_.get(), records_.get(), spans_.get(), sums.get(),
                                            out.means, out.quats, out.log_scales, out.opacities, out.colors, out.offset};
     parallel_for(threads, pieces_of(count_, kPiece), [&](int, int64_t piece) {
         run.geometry_gradient(geometry, piece * kPiece, std::min(count_, (piece + 1) * kPiece));
     });
+    seconds_[kGeometryGradient] = watch.lap();
 }
 
 template <class R>

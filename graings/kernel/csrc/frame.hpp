@@ -16,6 +16,12 @@ struct Gradients {
     R *means, *quats, *log_scales, *opacities, *colors, *background, *offset;  // offset may be null
 };
 
+struct DepthKey {
+    uint32_t key, id;
+};
+
+enum Stage { kProject, kSort, kBin, kBlend, kBlendGradient, kGeometryGradient, kStages };
+
 template <class R>
 class Frame {
 public:
@@ -27,17 +33,20 @@ public:
 
     const int64_t* statuses() const { return statuses_; }
     int64_t pairs() const { return pairs_; }
+    int64_t evaluated() const;  // pairs of pixel and Gaussian
+    const double* seconds() const { return seconds_; }  // per Stage
 
 private:
     void project(const ProjectArgs<R>&, std::vector<std::vector<uint32_t>>& lists, std::vector<int64_t>& counts, int threads);
-    std::vector<uint32_t> sorted(const double* depths, const int64_t* uids);
-    void bin(const std::vector<uint32_t>& order, const std::vector<std::vector<uint32_t>>& lists, const std::vector<int64_t>& counts, int threads);
+    std::vector<DepthKey> sorted(const double* depths, const int64_t* uids, int threads);
+    void bin(const std::vector<DepthKey>& order, const std::vector<std::vector<uint32_t>>& lists, const std::vector<int64_t>& counts, int threads);
     TileArgs<R> tile_args(const R* background) const;
 
     Camera camera_;
     Settings settings_;
     int64_t count_, tiles_, pairs_ = 0;
     int64_t statuses_[kStatuses] = {};
+    mutable double seconds_[kStages] = {};
     Buffer<uint8_t> status_;
     Buffer<Record<R>> records_;
     Buffer<Span> spans_;

@@ -122,6 +122,8 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         const D widened = min(fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30)), tilt = p.slope * sr / sy, root = sqrt(widened);
         const D high = root / sy, wide = root * sqrt(fma(tilt, tilt, d8(1))) / sr;
         double finite[8], bounded[8], squared[8], z[8], x[8], y[8], slope[8], a[8], c[8], sr_[8], sy_[8], level_[8], widened_[8], high_[8], wide_[8];
+        double largest[8];
+        store(largest, max(max(p.scale[0], p.scale[1]), max(p.scale[2], abs(p.z))));
         store(level_, level), store(widened_, widened), store(high_, high), store(wide_, wide);
         store(finite, p.finite), store(bounded, footprint), store(squared, p.squared), store(z, p.z), store(x, p.x);
         store(y, p.y), store(slope, p.slope), store(a, p.a), store(c, p.c), store(sr_, sr), store(sy_, sy);
@@ -131,7 +133,7 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
             double loose = finite[lane] + (opacity - opacity);
             for (int channel = 0; channel < 3; channel++) loose += double(in.colors[3 * i + channel]) - double(in.colors[3 * i + channel]);
             args.means2d[2 * i] = args.means2d[2 * i + 1] = args.radii[2 * i] = args.radii[2 * i + 1] = R(0);
-            if (!(loose == 0)) { args.status[i] = kNonFinite; continue; }
+            if (!(loose == 0 && largest[lane] <= s.far)) { args.status[i] = kNonFinite; continue; }
             if (!(squared[lane] >= 1e-24)) { args.status[i] = kZeroQuat; continue; }
             if (!(z[lane] > s.near)) { args.status[i] = kBehind; continue; }
             if (!(opacity > s.alpha_min)) { args.status[i] = kFaint; continue; }

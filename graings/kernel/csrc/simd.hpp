@@ -177,7 +177,16 @@ GRAINGS_VEC uint32_t bits(Mask<T, N> m) {
     if constexpr (kOne<T, N>) return bits_of(m.v);
     else return bits(m.lo) | bits(m.hi) << (N / 2);
 }
-GRAINGS_VEC Vec<T, N> abs(Vec<T, N> a) { return max(a, splat<T, N>(T(0)) - a); }
+GRAINGS_VEC Vec<T, N> abs(Vec<T, N> a) {
+    if constexpr (kOne<T, N>) {
+        constexpr auto magnitude = static_cast<typename Bits<T>::type>(~(1ull << (8 * sizeof(T) - 1)));
+        return {(Native<T>)((NativeBits<T>)a.v & magnitude)};
+    } else return {abs(a.lo), abs(a.hi)};
+}
+GRAINGS_VEC Mask<T, N> operator&(Mask<T, N> a, Mask<T, N> b) {
+    if constexpr (kOne<T, N>) return {static_cast<NativeMask<T>>(a.v & b.v)};
+    else return {a.lo & b.lo, a.hi & b.hi};
+}
 // Rounded to R and stored.
 template <class R, int N> GRAINGS_INLINE void store_as(R* p, Vec<double, N> a) {
     if constexpr (sizeof(R) == sizeof(double)) store(p, a);
@@ -221,8 +230,15 @@ template <int N> GRAINGS_INLINE Vec<double, N> power_of_two_part(Vec<double, N> 
     for (int k = 1; k < 14; k++) p = fma(p, f, splat<double, N>(c[k]));
     return p;
 }
-// 2^-x for x >= 0; far below any contribution (2^-125, 2^-1021) the value stays put.
+// 2^-x for x >= 0; far below any contribution (2^-125, 2^-1021) it need not be exact.
 GRAINGS_VEC Vec<T, N> exp2_minus(Vec<T, N> x) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(T) == 4 && kOne<T, N>) {
+        const __m512 whole = _mm512_roundscale_ps((__m512)x.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+        const Vec<T, N> f{(Native<T>)_mm512_sub_ps(whole, (__m512)x.v)};
+        return {(Native<T>)_mm512_scalef_ps((__m512)power_of_two_part(f).v, _mm512_sub_ps(_mm512_setzero_ps(), whole))};
+    }
+#endif
     constexpr T magic = sizeof(T) == 4 ? T(12582912) : T(6755399441055744);
     constexpr T limit = sizeof(T) == 4 ? T(125) : T(1021);
     x = min(x, splat<T, N>(limit));

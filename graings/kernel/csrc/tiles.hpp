@@ -22,19 +22,11 @@ GRAINGS_INLINE P<R> lanes_of(const double* numbers) {
     return load<kLanes>(lanes);
 }
 
-// Scaled distances are rounded to R only here, relative to the block, so that they stay accurate however far
-// the mean is and however long the needle.
 template <class R>
-GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top, P<R> columns, P<R> rows) {
-    using W = Vec<double, kBlocks>;
-    const double tilt = record.sr * record.slope, dy = top + 2 - record.y;
-    const double r = record.sr * ((left + 2 - record.x) - record.slope * dy), s = record.sy * dy;
-    const W x = load<kBlocks>(kBlockX), y = load<kBlocks>(kBlockY), wide = splat<double, kBlocks>(record.sr), tilted = splat<double, kBlocks>(-tilt);
-    store_as<R>(entry.center_r, fma(wide, x, fma(tilted, y, splat<double, kBlocks>(r))));
-    store_as<R>(entry.center_s, fma(splat<double, kBlocks>(record.sy), y, splat<double, kBlocks>(s)));
-    store(entry.spread, p16(R(record.sr)) * columns - p16(R(tilt)) * rows);
-    entry.sy = R(record.sy), entry.opacity = record.opacity, entry.depth = record.depth;
-    entry.red = record.red, entry.green = record.green, entry.blue = record.blue;
+GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top) {
+    const double dy = top + 2 - record.y, tilt = record.sr * record.slope;
+    entry = {record.sr * ((left + 2 - record.x) - record.slope * dy), record.sy * dy, record.sr, tilt, record.sy, R(record.sr), R(tilt), R(record.sy),
+             record.opacity, record.red, record.green, record.blue, record.depth};
 }
 
 // Blocks that a prepared entry reaches, one bit each: those where the least exponent over the rectangle of pixel
@@ -43,21 +35,22 @@ GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double
 // lies on the side of r's sign, where u is linear, or at an end. `slack` is more than all rounding of r, s and
 // those points, here and in the pixels.
 template <class R>
-GRAINGS_INLINE uint32_t reached_blocks(const TileEntry<R>& entry, const Record<R>& record) {
+GRAINGS_INLINE uint32_t reached_blocks(const TileEntry<R>& entry, R reach) {
     constexpr R unit = sizeof(R) == 4 ? R(1e-6) : R(2e-15);
     const auto size = [](R x) { return x < R(0) ? -x : x; };
-    const R sr = R(record.sr), sy = R(record.sy), lean = R(record.sr * record.slope), steep = size(lean), fall = R(1) / (lean * lean + sy * sy);
-    const R slack = unit * (size(entry.center_r[0]) + size(entry.center_s[0]) + R(32) * (sr + sy + steep));
-    const P<R> zero = p16(R(0)), high = p16(R(1.5)), low = p16(R(-1.5)), wide = p16(R(1.5) * sr + slack), loose = p16(slack);
-    const P<R> r = load<kBlocks>(entry.center_r), s = load<kBlocks>(entry.center_s), level = p16(record.level);
+    const R wide = entry.wide, rise = entry.rise, lean = entry.lean, steep = lean * lean, fall = R(1) / (steep + rise * rise);
+    const R slack = unit * (size(R(entry.r)) + size(R(entry.s)) + R(32) * (wide + rise + size(lean)));
+    const P<R> zero = p16(R(0)), high = p16(R(1.5)), low = p16(R(-1.5)), edge = p16(R(1.5) * wide + slack), loose = p16(slack);
+    const P<R> x = lanes_of<R>(kBlockX), y = lanes_of<R>(kBlockY), level = p16(reach);
+    const P<R> r = fma(p16(wide), x, fma(p16(-lean), y, p16(R(entry.r)))), s = fma(p16(rise), y, p16(R(entry.s)));
     const auto out = [&](P<R> t, P<R> dy) {
-        const P<R> u = max(abs(t) - wide, zero), v = max(abs(fma(p16(sy), dy, s)) - loose, zero);
+        const P<R> u = max(abs(t) - edge, zero), v = max(abs(fma(p16(rise), dy, s)) - loose, zero);
         return bits(level < fma(u, u, v * v));
     };
-    const P<R> flat = clamp(p16(R(-1) / sy) * s, low, high), t = r - p16(lean) * flat;
-    const P<R> side = select(t < zero, p16(R(-1.5) * sr), p16(R(1.5) * sr));
-    const P<R> lowest = clamp(p16(lean * fall) * (r - side) - p16(sy * fall) * s, low, high);
-    return ~(out(t, flat) & out(r - p16(lean) * lowest, lowest));
+    const P<R> flat = clamp(p16(R(-1) / rise) * s, low, high), t = fma(p16(-lean), flat, r);
+    const P<R> side = select(t < zero, p16(R(-1.5) * wide), p16(R(1.5) * wide));
+    const P<R> lowest = clamp(fma(p16(lean * fall), r - side, p16(-rise * fall) * s), low, high);
+    return ~(out(t, flat) & out(fma(p16(-lean), lowest, r), lowest));
 }
 
 // entries[b]: which of n <= 32 masks have bit b.
@@ -73,9 +66,13 @@ GRAINGS_INLINE void by_block(const uint16_t* masks, uint32_t* entries) {
 }
 template <class R> struct Distance { P<R> r, s; };
 
+// Rounded to R only here, relative to the block, so that they stay accurate however far the mean is and however
+// long the needle.
 template <class R>
-GRAINGS_INLINE Distance<R> distance(const TileEntry<R>& entry, int block, P<R> rows) {
-    return {load<kLanes>(entry.spread) + p16(entry.center_r[block]), fma(rows, p16(entry.sy), p16(entry.center_s[block]))};
+GRAINGS_INLINE Distance<R> distance(const TileEntry<R>& entry, int block, P<R> columns, P<R> rows) {
+    const double x = kBlockX[block], y = kBlockY[block];
+    const R r = R(entry.r + (entry.sr * x - entry.tilt * y)), s = R(entry.s + entry.sy * y);
+    return {fma(p16(entry.wide), columns, fma(p16(-entry.lean), rows, p16(r))), fma(p16(entry.rise), rows, p16(s))};
 }
 
 template <class R>
@@ -87,27 +84,27 @@ template <class R> struct Rule { R alpha_min, alpha_max, transmittance_min; };
 template <class R>
 GRAINGS_INLINE Rule<R> rule(const Settings& s) { return {R(s.alpha_min), R(s.alpha_max), R(s.transmittance_min)}; }
 
-template <class R>
-GRAINGS_INLINE P<R> drawn_alpha(P<R> raw, const Rule<R>& rule) {
-    return select(p16(rule.alpha_min) <= raw, min(raw, p16(rule.alpha_max)), p16(R(0)));
-}
+// One step of light through a pixel. `light` is what still passes; a pixel below transmittance_min has stopped and
+// keeps it. In compat the entry that would cross is left out, and `open` remembers that the pixel has stopped.
+template <class R> struct Step { P<R> alpha, weight; };  // both 0 where the entry does not count
 
-// One step of light through a pixel. `open` is the transmittance, 0 once the pixel has stopped; `left` is what
-// finally reaches the background. Returns the blending weight.
 template <class R, bool Compat>
-GRAINGS_INLINE P<R> blend(P<R> alpha, const Rule<R>& rule, P<R>& open, P<R>& left) {
-    const P<R> zero = p16(R(0));
-    P<R> weight = alpha * open;
-    const P<R> next = open * (p16(R(1)) - alpha);
-    const auto stops = next < p16(rule.transmittance_min);
-    if constexpr (Compat) {  // the one that would cross is left out
-        left = select(stops, left, next);
-        weight = select(stops, zero, weight);
+GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& open) {
+    const P<R> zero = p16(R(0)), stop = p16(rule.transmittance_min), capped = min(raw, p16(rule.alpha_max));
+    const auto drawn = p16(rule.alpha_min) <= raw;
+    if constexpr (Compat) {
+        P<R> alpha = select(drawn & (zero < open), capped, zero);
+        const P<R> next = light * (p16(R(1)) - alpha);
+        const auto stops = next < stop;
+        open = select(stops, zero, open), alpha = select(stops, zero, alpha);
+        const P<R> weight = alpha * light;
+        light = select(stops, light, next);
+        return {alpha, weight};
     } else {
-        left = select(zero < open, next, left);
+        const P<R> alpha = select(drawn & (stop <= light), capped, zero), weight = alpha * light;
+        light = light * (p16(R(1)) - alpha);
+        return {alpha, weight};
     }
-    open = select(stops, zero, next);
-    return weight;
 }
 
 struct TileBox {
@@ -140,9 +137,9 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
     const TileBox box = tile_box(args.camera, tile);
     const Rule<R> limits = rule<R>(args.settings);
     const P<R> columns = lanes_of<R>(kColumns), rows = lanes_of<R>(kRows);
-    alignas(64) R open[kBlocks][kLanes], left[kBlocks][kLanes], channels[4][kBlocks][kLanes];
+    alignas(64) R open[kBlocks][kLanes], light[kBlocks][kLanes], channels[4][kBlocks][kLanes];
     uint32_t live = open_lanes(box, open);
-    std::memcpy(left, open, sizeof left);
+    std::memcpy(light, open, sizeof light);
     std::memset(channels, 0, sizeof channels);
 
     int64_t k = args.begin[tile];
@@ -155,45 +152,44 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
         for (int j = 0; j < n; j++) {
             if (k + j + 8 < end) __builtin_prefetch(&args.records[args.ids[k + j + 8]]);
             const Record<R>& record = args.records[args.ids[k + j]];
-            prepare(chunk[j], record, double(box.left), double(box.top), columns, rows);
-            args.masks[k + j] = masks[j] = uint16_t((Compat ? 0xFFFFu : reached_blocks(chunk[j], record)) & live);
+            prepare(chunk[j], record, double(box.left), double(box.top));
+            args.masks[k + j] = masks[j] = uint16_t((Compat ? 0xFFFFu : reached_blocks(chunk[j], record.level)) & live);
             items += __builtin_popcount(masks[j]);
         }
         k += n;
         by_block(masks, lists);
         for (int b = 0; b < kBlocks; b++) {
             if (lists[b] == 0) continue;
-            P<R> t = load<kLanes>(open[b]), rest = load<kLanes>(left[b]);
+            P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]);
             P<R> red = load<kLanes>(channels[0][b]), green = load<kLanes>(channels[1][b]);
             P<R> blue = load<kLanes>(channels[2][b]), depth = load<kLanes>(channels[3][b]);
             for (uint32_t list = lists[b]; list; list &= list - 1) {
                 const TileEntry<R>& entry = chunk[__builtin_ctz(list)];
-                const P<R> alpha = drawn_alpha(uncapped_alpha(entry, distance(entry, b, rows)), limits);
-                const P<R> weight = blend<R, Compat>(alpha, limits, t, rest);
+                const P<R> weight = blend<R, Compat>(uncapped_alpha(entry, distance(entry, b, columns, rows)), limits, t, going).weight;
                 red = fma(weight, p16(entry.red), red);
                 green = fma(weight, p16(entry.green), green);
                 blue = fma(weight, p16(entry.blue), blue);
                 depth = fma(weight, p16(entry.depth), depth);
             }
-            store(open[b], t), store(left[b], rest);
+            store(light[b], t), store(open[b], going);
             store(channels[0][b], red), store(channels[1][b], green), store(channels[2][b], blue), store(channels[3][b], depth);
-            if (!any(p16(R(0)) < t)) live &= ~(1u << b);
+            if (!any(Compat ? p16(R(0)) < going : p16(limits.transmittance_min) <= t)) live &= ~(1u << b);
         }
     }
     args.processed[tile] = int32_t(k - start);
     args.items[tile] = items;
 
     for (int b = 0; b < kBlocks; b++) {
-        const P<R> t = load<kLanes>(left[b]);
+        const P<R> t = load<kLanes>(light[b]);
         for (int c = 0; c < 3; c++) store(channels[c][b], fma(t, p16(args.background[c]), load<kLanes>(channels[c][b])));
-        store(left[b], p16(R(1)) - t);
+        store(light[b], p16(R(1)) - t);
     }
     for (int y = 0; y < box.height; y++) {
         R color[3 * kTile], alpha[kTile], depth[kTile];
         for (int x = 0; x < kTile; x++) {
             const int b = (y >> 2) * 4 + (x >> 2), l = (y & 3) * 4 + (x & 3);
             color[3 * x] = channels[0][b][l], color[3 * x + 1] = channels[1][b][l], color[3 * x + 2] = channels[2][b][l];
-            alpha[x] = left[b][l], depth[x] = channels[3][b][l];
+            alpha[x] = light[b][l], depth[x] = channels[3][b][l];
         }
         const int64_t pixel = (box.top + y) * args.camera.width + box.left;
         std::memcpy(args.color + 3 * pixel, color, sizeof(R) * size_t(3 * box.width));
@@ -240,10 +236,8 @@ GRAINGS_INLINE void sums_of_twelve(const P<R>* v, R* out) {
         }
         const __m512 last = pairs(pairs(quarter[0], quarter[1]), pairs(quarter[2], quarter[2]));
         // quad q: vector q of quarters 0, 1, 2, 2
-        R lanes[kLanes];
-        std::memcpy(lanes, &last, sizeof lanes);
-        for (int i = 0; i < 3; i++)
-            for (int q = 0; q < 4; q++) out[4 * i + q] = lanes[4 * q + i];
+        const __m512i in_order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+        _mm512_mask_storeu_ps(out, 0x0FFF, _mm512_permutexvar_ps(in_order, last));
         return;
     }
 #endif
@@ -292,9 +286,9 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const
     }
 
     // forward again, to keep alpha and weight of every (entry, block)
-    alignas(64) R open[kBlocks][kLanes], left[kBlocks][kLanes], behind[kBlocks][kLanes];
+    alignas(64) R open[kBlocks][kLanes], light[kBlocks][kLanes], behind[kBlocks][kLanes];
     open_lanes(box, open);
-    std::memcpy(left, open, sizeof left);
+    std::memcpy(light, open, sizeof light);
     const int n = args.processed[tile];
     int32_t item = 0;
     for (int first = 0; first < n; first += kChunk) {
@@ -307,33 +301,28 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const
             masks[i] = args.masks[begin + j];
             scratch.first_item[j] = item;
             item += __builtin_popcount(masks[i]);
-            if (masks[i]) prepare(scratch.entries[j], args.records[args.ids[begin + j]], double(box.left), double(box.top), columns, rows);
+            if (masks[i]) prepare(scratch.entries[j], args.records[args.ids[begin + j]], double(box.left), double(box.top));
         }
         by_block(masks, lists);
         for (int b = 0; b < kBlocks; b++) {
             if (lists[b] == 0) continue;
-            P<R> t = load<kLanes>(open[b]), rest = load<kLanes>(left[b]);
+            P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]);
             for (uint32_t list = lists[b]; list; list &= list - 1) {
                 const int i = __builtin_ctz(list);
                 const int64_t at = (scratch.first_item[first + i] + __builtin_popcount(masks[i] & ((1u << b) - 1))) * kLanes;
                 const TileEntry<R>& entry = scratch.entries[first + i];
-                const P<R> was_open = t;
-                const P<R> raw = uncapped_alpha(entry, distance(entry, b, rows));
-                const P<R> alpha = drawn_alpha(raw, limits);
-                const P<R> weight = blend<R, Compat>(alpha, limits, t, rest);
-                // a stopped lane behaves as if the entry were not there
-                P<R> kept = select(zero < was_open, alpha, zero);
-                if constexpr (Compat) kept = select(zero < weight, alpha, zero);
-                store(scratch.alphas + at, kept);
-                store(scratch.weights + at, select(p16(limits.alpha_max) < raw, zero - weight, weight));
+                const P<R> raw = uncapped_alpha(entry, distance(entry, b, columns, rows));
+                const Step<R> step = blend<R, Compat>(raw, limits, t, going);
+                store(scratch.alphas + at, step.alpha);
+                store(scratch.weights + at, select(p16(limits.alpha_max) < raw, zero - step.weight, step.weight));
             }
-            store(open[b], t), store(left[b], rest);
+            store(light[b], t), store(open[b], going);
         }
     }
 
     // what a pixel sees behind the current entry, weighed by its upstream: starts at the background
     for (int b = 0; b < kBlocks; b++) {
-        const P<R> t = load<kLanes>(left[b]);
+        const P<R> t = load<kLanes>(light[b]);
         P<R> sum_ = zero;
         for (int c = 0; c < 3; c++) {
             const P<R> g = load<kLanes>(up[c][b]);
@@ -358,10 +347,10 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const
         P<R> red = zero, green = zero, blue = zero, depth = zero;
         for (; mask; mask &= mask - 1, alphas += kLanes, weights += kLanes) {
             const int b = __builtin_ctz(mask);
-            const Distance<R> d = distance(entry, b, rows);
+            const Distance<R> d = distance(entry, b, columns, rows);
             const P<R> alpha = load<kLanes>(alphas), signed_weight = load<kLanes>(weights);
             const P<R> passing = max(signed_weight, zero);            // capped alpha passes no gradient
-            const P<R> weight = max(signed_weight, zero - signed_weight);
+            const P<R> weight = abs(signed_weight);
             const P<R> g0 = load<kLanes>(up[0][b]), g1 = load<kLanes>(up[1][b]), g2 = load<kLanes>(up[2][b]);
             P<R> own = fma(g0, p16(entry.red), fma(g1, p16(entry.green), g2 * p16(entry.blue)));
             if constexpr (Extra) {

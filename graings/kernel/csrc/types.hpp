@@ -20,7 +20,7 @@ struct Camera {
 };
 
 struct Settings {
-    double alpha_min, transmittance_min, alpha_max, blur, near, frustum_margin;
+    double alpha_min, transmittance_min, alpha_max, blur, near, far, frustum_margin;
     bool compat;  // exclusive stop and the square of three standard deviations, as public rasterizers do
 };
 
@@ -40,14 +40,12 @@ struct Span {
     uint32_t begin, count, first_row, last_row;
 };
 
-// A record seen from one tile: the scaled distances at the centre of each block (rounded once, from float64)
-// and their spread over the 16 pixels of a block.
+// A record seen from one tile: its scaled distances at the centre of the first block, in float64 as long as large
+// numbers may cancel, and how they change from block to block and from pixel to pixel.
 template <class R>
-struct alignas(64) TileEntry {
-    R spread[kLanes];
-    R center_r[kBlocks];
-    R center_s[kBlocks];
-    R sy, opacity, red, green, blue, depth;
+struct TileEntry {
+    double r, s, sr, tilt, sy;
+    R wide, lean, rise, opacity, red, green, blue, depth;  // wide, lean, rise: sr, tilt, sy rounded
 };
 
 template <class R>

@@ -1,0 +1,103 @@
+"""How the rasterizer's time grows: against Gaussians, against pixels, against threads, stage by stage.
+
+    python benchmarks/raster_scaling.py --yardstick DIR -o FOLDER [--rounds 11]        (needs the extra `bench`)
+
+DIR holds `bench_scene.py` (see rasterize.py). Writes FOLDER/raster_scaling.{json,svg} and prints, for every stage, the
+slope of log time against log size: 1 is linear, 0 does not grow. Medians of wall-clock milliseconds of one forward +
+backward.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+from matplotlib import pyplot
+
+from graings import kernel
+from graings.threads import use_threads
+
+sys.path.insert(0, str(Path(__file__).parent))
+from rasterize import Ours, load
+
+COUNTS = (10_000, 25_000, 50_000, 100_000, 200_000)
+SIZES = (200, 400, 800, 1600)
+
+
+def stages(ours: Ours, rounds: int) -> dict[str, float]:
+    """Median milliseconds of every stage."""
+    seen: dict[str, list[float]] = {}
+    for turn in range(rounds + 2):
+        color = ours.result().color
+        upstream = torch.sign(color.detach() - ours.target) / ours.target.numel()
+        frame: Any = color.grad_fn.frame
+        torch.autograd.grad(color, list(ours.leaves.values()), upstream)
+        if turn >= 2:
+            for name, seconds in frame.seconds.items():
+                seen.setdefault(name, []).append(1e3 * seconds)
+    return {name: statistics.median(values) for name, values in seen.items()}
+
+
+def slope(points: list[tuple[float, float]]) -> float:
+    """Least squares through log-log points."""
+    xs, ys = [math.log(x) for x, _ in points], [math.log(max(y, 1e-6)) for _, y in points]
+    mx, my = statistics.fmean(xs), statistics.fmean(ys)
+    return sum((x - mx) * (y - my) for x, y in zip(xs, ys, strict=True)) / sum((x - mx) ** 2 for x in xs)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--yardstick", type=Path, required=True)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--rounds", type=int, default=11)
+    options = parser.parse_args()
+    scenes = load(options.yardstick, "bench_scene")
+    if scenes is None:
+        parser.error(f"{options.yardstick / 'bench_scene.py'} not found: give its folder with --yardstick")
+
+    def measure(count: int, size: int, threads: int) -> dict[str, float]:
+        use_threads(threads)
+        raw, view = scenes.make_scene(count), scenes.camera(size)
+        return stages(Ours(raw, view, torch.from_numpy(scenes.target_image(size, size))), options.rounds)
+
+    cores = kernel.usable_cores()
+    series: dict[str, dict[int, dict[str, float]]] = {
+        "Gaussians, at 800 px": {count: measure(count, 800, cores) for count in COUNTS},
+        "pixels, with 50 000 Gaussians": {size * size: measure(50_000, size, cores) for size in SIZES},
+        "threads, 200 000 Gaussians at 800 px": {n: measure(200_000, 800, n) for n in range(1, cores + 1)},
+    }
+    figure, axes = pyplot.subplots(1, len(series), figsize=(15, 4.5), layout="constrained", sharey=True)
+    for axis, (title, rows) in zip(axes, series.items(), strict=True):
+        print(f"\nagainst {title}")
+        lines = {name: [(float(x), row[name]) for x, row in rows.items()] for name in next(iter(rows.values()))}
+        lines["all"] = [(float(x), sum(row.values())) for x, row in rows.items()]
+        for name, points in lines.items():
+            numbers = "  ".join(f"{y:8.2f}" for _, y in points)
+            print(f"  {name:<18} {numbers}   slope {slope(points):5.2f}")
+            style = {"color": "black", "linewidth": 2.2} if name == "all" else {}
+            axis.loglog(
+                *zip(*points, strict=True), marker="o", markersize=3, label=f"{name} ({slope(points):.2f})", **style
+            )
+        axis.set_xlabel(title)
+        axis.grid(True, which="major", color="0.9")
+        axis.legend(fontsize=8, frameon=False, title="stage (slope)", title_fontsize=8)
+    axes[0].set_ylabel("milliseconds")
+    figure.suptitle(f"What one forward + backward of the rasterizer costs ({kernel.active_isa()}, {cores} threads)")
+    options.output.mkdir(parents=True, exist_ok=True)
+    document = {
+        "isa": kernel.active_isa(),
+        "threads": cores,
+        "series": {title: {str(x): row for x, row in rows.items()} for title, rows in series.items()},
+    }
+    (options.output / "raster_scaling.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+    figure.savefig(options.output / "raster_scaling.svg")
+
+
+if __name__ == "__main__":
+    main()

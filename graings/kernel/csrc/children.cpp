@@ -1,0 +1,170 @@
+#include "children.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+#include "pool.hpp"
+
+namespace graings {
+namespace {
+
+constexpr int64_t kPiece = 2048;  // children handed to a thread at a time
+
+template <class Body>
+void in_pieces(int threads, int64_t count, Body body) {
+    parallel_for(threads, (count + kPiece - 1) / kPiece, [&](int, int64_t piece) { body(piece * kPiece, std::min(count, (piece + 1) * kPiece)); });
+}
+
+// Runs of anchors with about as many children each: body(first anchor, last, first child, last).
+template <class Body>
+void in_runs(int threads, int64_t anchors, int64_t slots, int64_t drawn, const int64_t* children, Body body) {
+    constexpr int64_t kRun = 512;
+    parallel_for(threads, (anchors + kRun - 1) / kRun, [&](int, int64_t run) {
+        const int64_t first = run * kRun, last = std::min(anchors, first + kRun);
+        const int64_t* from = std::lower_bound(children, children + drawn, first * slots);
+        const int64_t* to = std::lower_bound(from, children + drawn, last * slots);
+        body(first, last, from - children, to - children);
+    });
+}
+
+template <class R> struct Quat { R w, x, y, z; };
+
+template <class R>
+Quat<R> product(const Quat<R>& a, const Quat<R>& b) {
+    return {a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z, a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
+            a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x, a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w};
+}
+template <class R> Quat<R> conjugate(const Quat<R>& q) { return {q.w, -q.x, -q.y, -q.z}; }
+
+// Below this norm there is no direction (as torch's normalize, whose divisor stops there).
+constexpr double kLeastNorm = 1e-12;
+
+template <class R>
+Quat<R> canonical(const R* raw, R& norm) {
+    const Quat<R> q{raw[0] + R(1), raw[1], raw[2], raw[3]};
+    norm = std::max(std::sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z), R(kLeastNorm));
+    return {q.w / norm, q.x / norm, q.y / norm, q.z / norm};
+}
+
+template <class R> Quat<R> turn(const R* moved) { return {moved[3] + R(1), moved[4], moved[5], moved[6]}; }
+
+// A NaN passes through: it must reach whoever looks for one.
+template <class R> R clip(R x, R low, R high) { return x < low ? low : x > high ? high : x; }
+
+// The gradient that passes a clip at x.
+template <class R>
+R through(R v, R x, R low, R high, bool projected) {
+    if (x > high) return projected && v > R(0) ? v : R(0);
+    if (x < low) return projected && v < R(0) ? v : R(0);
+    return v;
+}
+
+}  // namespace
+
+template <class R>
+void gather(const Anchors<R>& anchors, int64_t drawn, const int64_t* children, R* row, R* centre, R* base, int threads) {
+    const int64_t slots = anchors.slots, features = anchors.features, width = features + 3 + slots;
+    for (int64_t i = 0; i < drawn; i++)
+        if (children[i] < (i ? children[i - 1] + 1 : 0) || children[i] >= anchors.count * slots)
+            throw std::invalid_argument("children must be slots of these anchors in ascending order");
+    in_pieces(threads, drawn, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; i++) {
+            const int64_t owner = children[i] / slots, slot = children[i] % slots;
+            R* to = row + i * width;
+            std::copy_n(anchors.feature + owner * features, features, to);
+            std::copy_n(anchors.offset + 3 * children[i], 3, to + features);
+            std::fill_n(to + features + 3, slots, R(0));
+            to[features + 3 + slot] = R(1);
+            for (int c = 0; c < 3; c++) {
+                const R scale = anchors.log_scale[3 * owner + c];
+                base[3 * i + c] = scale;
+                centre[3 * i + c] = anchors.place[3 * owner + c] + std::exp(scale) * anchors.offset[3 * children[i] + c];
+            }
+        }
+    });
+}
+
+template <class R>
+void gather_gradient(const Anchors<R>& anchors, int64_t drawn, const int64_t* children, const R* v_row, const R* v_centre, const R* v_base, R* v_feature, R* v_log_scale,
+                     R* v_offset, int threads) {
+    const int64_t slots = anchors.slots, features = anchors.features, width = features + 3 + slots;
+    in_runs(threads, anchors.count, slots, drawn, children, [&](int64_t first, int64_t last, int64_t from, int64_t to) {
+        std::fill(v_feature + first * features, v_feature + last * features, R(0));
+        std::fill(v_log_scale + 3 * first, v_log_scale + 3 * last, R(0));
+        std::fill(v_offset + 3 * first * slots, v_offset + 3 * last * slots, R(0));
+        for (int64_t i = from; i < to; i++) {
+            const int64_t owner = children[i] / slots;
+            const R* v = v_row + i * width;
+            R* feature = v_feature + owner * features;
+            for (int64_t f = 0; f < features; f++) feature[f] += v[f];
+            for (int c = 0; c < 3; c++) {
+                const R stretch = std::exp(anchors.log_scale[3 * owner + c]), g = v_centre[3 * i + c] * stretch;
+                v_offset[3 * children[i] + c] = v[features + c] + g;
+                v_log_scale[3 * owner + c] += v_base[3 * i + c] + g * anchors.offset[3 * children[i] + c];
+            }
+        }
+    });
+}
+
+template <class R>
+void compose(const Answers<R>& in, R* mean, R* quat, R* log_scale, int threads) {
+    const R extent = R(in.extent), change = R(in.bounds.change), low = R(in.bounds.low), high = R(in.bounds.high);
+    in_pieces(threads, in.drawn, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; i++) {
+            const R* moved = in.moved ? in.moved + 10 * i : nullptr;
+            R norm;
+            Quat<R> q = canonical(in.canonical + 7 * i, norm);
+            if (moved) q = product(q, turn(moved));
+            quat[4 * i] = q.w, quat[4 * i + 1] = q.x, quat[4 * i + 2] = q.y, quat[4 * i + 3] = q.z;
+            for (int c = 0; c < 3; c++) {
+                R scale = in.base[3 * i + c] + in.canonical[7 * i + 4 + c];
+                mean[3 * i + c] = in.centre[3 * i + c];
+                if (moved) mean[3 * i + c] += moved[c] * extent, scale += clip(moved[7 + c], -change, change);
+                log_scale[3 * i + c] = clip(scale, low, high);
+            }
+        }
+    });
+}
+
+template <class R>
+void compose_gradient(const Answers<R>& in, const R* v_mean, const R* v_quat, const R* v_log_scale, R* v_canonical, R* v_moved, int threads) {
+    const R extent = R(in.extent), change = R(in.bounds.change), low = R(in.bounds.low), high = R(in.bounds.high);
+    in_pieces(threads, in.drawn, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; i++) {
+            const R* moved = in.moved ? in.moved + 10 * i : nullptr;
+            R norm;
+            const Quat<R> q = canonical(in.canonical + 7 * i, norm);
+            Quat<R> v{v_quat[4 * i], v_quat[4 * i + 1], v_quat[4 * i + 2], v_quat[4 * i + 3]};
+            if (moved) {
+                // quaternions multiply without changing angles: the adjoint of a factor is its conjugate
+                const Quat<R> t = product(conjugate(q), v);
+                v_moved[10 * i + 3] = t.w, v_moved[10 * i + 4] = t.x, v_moved[10 * i + 5] = t.y, v_moved[10 * i + 6] = t.z;
+                v = product(v, conjugate(turn(moved)));
+            }
+            const R along = norm > R(kLeastNorm) ? v.w * q.w + v.x * q.x + v.y * q.y + v.z * q.z : R(0);
+            R* to = v_canonical + 7 * i;
+            to[0] = (v.w - along * q.w) / norm, to[1] = (v.x - along * q.x) / norm, to[2] = (v.y - along * q.y) / norm, to[3] = (v.z - along * q.z) / norm;
+            for (int c = 0; c < 3; c++) {
+                R scale = in.base[3 * i + c] + in.canonical[7 * i + 4 + c];
+                if (moved) scale += clip(moved[7 + c], -change, change);
+                const R g = through(v_log_scale[3 * i + c], scale, low, high, in.bounds.projected);
+                to[4 + c] = g;
+                if (!moved) continue;
+                v_moved[10 * i + c] = v_mean[3 * i + c] * extent;
+                v_moved[10 * i + 7 + c] = through(g, moved[7 + c], -change, change, in.bounds.projected);
+            }
+        }
+    });
+}
+
+#define GRAINGS_INSTANTIATE(R)                                                                                                           \
+    template void gather<R>(const Anchors<R>&, int64_t, const int64_t*, R*, R*, R*, int);                                                \
+    template void gather_gradient<R>(const Anchors<R>&, int64_t, const int64_t*, const R*, const R*, const R*, R*, R*, R*, int);          \
+    template void compose<R>(const Answers<R>&, R*, R*, R*, int);                                                                        \
+    template void compose_gradient<R>(const Answers<R>&, const R*, const R*, const R*, R*, R*, int);
+GRAINGS_INSTANTIATE(float)
+GRAINGS_INSTANTIATE(double)
+#undef GRAINGS_INSTANTIATE
+
+}  // namespace graings

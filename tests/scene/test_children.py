@@ -1,0 +1,183 @@
+"""The two operators around the networks: equal to plain torch, same bits on any number of threads, clear refusals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from graings import kernel
+from graings.scene.children import (
+    LOG_SCALE_BOUND,
+    LOG_SCALE_RANGE,
+    Children,
+    compose,
+    gather,
+    plain_compose,
+    plain_gather,
+    quaternion_product,
+)
+from graings.scene.scaffold import Scaffold
+
+SLOTS = 3
+
+Answers = tuple[Tensor, Children, Tensor | None]
+
+
+def scaffold(anchors: int, dtype: torch.dtype = torch.float64) -> Scaffold:
+    random = torch.Generator().manual_seed(anchors)
+    shapes = ((anchors, 3), (anchors, 3), (anchors, 5), (anchors, SLOTS, 3))
+    return Scaffold(*(torch.randn(shape, generator=random, dtype=torch.float64).to(dtype) for shape in shapes))
+
+
+def some(anchors: int, share: float = 0.4) -> Tensor:
+    return (torch.rand(anchors * SLOTS, generator=torch.Generator().manual_seed(7)) < share).nonzero().squeeze(-1)
+
+
+def answers(drawn: int, dtype: torch.dtype, *, moves: bool) -> Answers:
+    """Some log-scales beyond both bounds, one quaternion without direction."""
+    random = torch.Generator().manual_seed(drawn)
+
+    def numbers(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=random, dtype=torch.float64).to(dtype)
+
+    canonical, moved = numbers(drawn, 7), numbers(drawn, 10) * 2
+    canonical[0, :4] = torch.tensor([-1.0, 0.0, 0.0, 0.0])
+    canonical[1, 4:], canonical[2, 4:] = 9.0, -30.0
+    return canonical, Children(numbers(drawn, 1), numbers(drawn, 3), numbers(drawn, 3)), moved if moves else None
+
+
+def gathered(function: Callable[..., Children], given: Scaffold, children: Tensor) -> list[Tensor]:
+    """Values and gradients for a fixed random upstream."""
+    for parameter in given.parameters():
+        parameter.grad = None
+    result = function(given, children)
+    values = [result.inputs, result.centres, result.log_scales]
+    random = torch.Generator().manual_seed(3)
+    upstream = [torch.randn(v.shape, generator=random, dtype=torch.float64).to(v.dtype) for v in values]
+    torch.autograd.backward(values, upstream)
+    return [*(v.detach() for v in values), given.features.grad, given.log_scales.grad, given.offsets.grad]  # type: ignore[list-item]
+
+
+def composed(function: Callable[..., tuple[Tensor, ...]], given: Answers, *, projected: bool = True) -> list[Tensor]:
+    canonical, children, moved = given
+    leaves = [t.clone().requires_grad_() for t in (canonical, children.log_scales, children.centres)]
+    if moved is not None:
+        leaves.append(moved.clone().requires_grad_())
+    drawn = Children(children.inputs, leaves[2], leaves[1])
+    values = function(leaves[0], drawn, leaves[3] if moved is not None else None, 1.7, projected_clip=projected)
+    random = torch.Generator().manual_seed(4)
+    upstream = [torch.randn(v.shape, generator=random, dtype=torch.float64).to(v.dtype) for v in values]
+    return [*(v.detach() for v in values), *torch.autograd.grad(values, leaves, upstream)]
+
+
+def assert_close(ours: list[Tensor], plain: list[Tensor], relative: float) -> None:
+    for one, other in zip(ours, plain, strict=True):
+        assert (one - other).norm() <= relative * other.norm()
+
+
+@pytest.mark.parametrize(("dtype", "relative"), [(torch.float64, 1e-14), (torch.float32, 1e-6)])
+@pytest.mark.parametrize("anchors", [1, 40, 1500])
+def test_gather_equals_plain_torch(anchors: int, dtype: torch.dtype, relative: float) -> None:
+    children = some(anchors, 0.7)
+    assert_close(
+        gathered(gather, scaffold(anchors, dtype), children),
+        gathered(plain_gather, scaffold(anchors, dtype), children),
+        relative,
+    )
+
+
+@pytest.mark.parametrize(("dtype", "relative"), [(torch.float64, 1e-14), (torch.float32, 1e-6)])
+@pytest.mark.parametrize("projected", [True, False])
+@pytest.mark.parametrize("moves", [True, False])
+def test_compose_equals_plain_torch(moves: bool, projected: bool, dtype: torch.dtype, relative: float) -> None:
+    given = answers(3000, dtype, moves=moves)
+    ours, plain = (composed(f, given, projected=projected) for f in (compose, plain_compose))
+    # A quaternion without direction has a derivative of 1e12 in its first row: compared apart, it would hide the rest.
+    for values in (ours, plain):
+        assert values[3][0, :4].isfinite().all()
+        values[3][0, :4] = 0
+    assert_close(ours, plain, relative)
+
+
+def test_bounds_hold() -> None:
+    _, _, log_scales = compose(*answers(50, torch.float32, moves=True), 1.0, projected_clip=True)
+    assert log_scales.min() >= LOG_SCALE_RANGE[0]
+    assert log_scales.max() <= LOG_SCALE_RANGE[1]
+    still = Children(torch.zeros(1, 1), torch.zeros(1, 3), torch.zeros(1, 3))
+    moved = torch.tensor([[0.0] * 7 + [3.0, 0.5, -9.0]])
+    _, _, change = compose(torch.zeros(1, 7), still, moved, 1.0, projected_clip=True)
+    assert torch.equal(change, torch.tensor([[LOG_SCALE_BOUND, 0.5, -LOG_SCALE_BOUND]]))
+
+
+def test_a_nan_is_not_hidden_by_a_bound() -> None:
+    canonical, children, moved = answers(5, torch.float32, moves=True)
+    canonical[3] = torch.nan
+    means, quats, log_scales = compose(canonical, children, moved, 1.0, projected_clip=True)
+    assert quats[3].isnan().all()
+    assert log_scales[3].isnan().all()
+    assert means.isfinite().all()
+
+
+def test_gradcheck_passes() -> None:
+    given = scaffold(6)
+    children = some(6, 0.6)
+    random = torch.Generator().manual_seed(1)
+    moved = torch.randn(len(children), 10, generator=random, dtype=torch.float64) * 0.3
+    canonical = torch.randn(len(children), 7, generator=random, dtype=torch.float64) * 0.3
+
+    def through(*values: Tensor) -> tuple[Tensor, ...]:
+        holder = scaffold(6)
+        for name, value in zip(("features", "log_scales", "offsets"), values, strict=False):
+            delattr(holder, name)
+            setattr(holder, name, value)
+        drawn = gather(holder, children)
+        return (*compose(values[3], drawn, values[4], 1.3, projected_clip=False), drawn.inputs)
+
+    leaves = [
+        t.detach().clone().requires_grad_() for t in (given.features, given.log_scales, given.offsets, canonical, moved)
+    ]
+    assert torch.autograd.gradcheck(through, leaves)
+
+
+def test_any_number_of_threads_gives_the_same_bits() -> None:
+    results = []
+    for threads in (1, 4):
+        kernel.set_threads(threads)
+        results.append(
+            [
+                *gathered(gather, scaffold(9000, torch.float32), some(9000)),
+                *composed(compose, answers(9000, torch.float32, moves=True)),
+            ]
+        )
+    kernel.set_threads(None)
+    assert all(torch.equal(one, many) for one, many in zip(*results, strict=True))
+
+
+def test_children_out_of_order_or_range_are_refused() -> None:
+    for wrong in ([2, 1], [1, 1], [-1], [12]):
+        with pytest.raises(ValueError, match="ascending order"):
+            gather(scaffold(4), torch.tensor(wrong))
+
+
+def test_nothing_drawn_gives_nothing_and_no_gradient() -> None:
+    values = gathered(gather, scaffold(4), torch.zeros(0, dtype=torch.int64))
+    assert all(len(v) == 0 for v in values[:3])
+    assert all(not v.any() for v in values[3:])
+
+
+def test_child_centres_follow_anchor_scale_and_offset() -> None:
+    given, children = scaffold(20), torch.tensor([0, 4, 59])
+    for row, child in zip(gather(given, children).centres, children.tolist(), strict=True):
+        anchor, slot = divmod(child, SLOTS)
+        expected = given.anchors[anchor] + given.log_scales[anchor].exp() * given.offsets[anchor, slot]
+        torch.testing.assert_close(row, expected, rtol=1e-15, atol=1e-15)
+
+
+def test_quaternion_product_is_rotation_after_rotation() -> None:
+    half = math.sqrt(0.5)
+    about_x, about_y = torch.tensor([[half, half, 0, 0]]), torch.tensor([[half, 0, half, 0]])
+    assert torch.allclose(quaternion_product(about_x, about_y), torch.tensor([[0.5, 0.5, 0.5, 0.5]]), atol=1e-7)
