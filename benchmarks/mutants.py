@@ -1,0 +1,277 @@
+"""Tests the tests: breaks the formulas one at a time and asks which test notices.
+
+    python benchmarks/mutants.py [--only a,b] [--list] [--keep DIR]
+
+A mutant is a small change of the source, "this text becomes that text". Each is applied to a copy of the package in a
+temporary folder, the kernel is built again there where C++ changed, and the fast tests run until the first one fails. A
+mutant that no test notices has survived, and the exit code is 1. The text to change must occur exactly once: after a
+formula has been rewritten, so must its mutant be, and the script says which.
+
+Mutants (a) to (h) break the rasterizer and are tried by tests/raster. Mutant (i) rounds times before they are
+normalised; the rasterizer knows no times, so it is tried by the tests of normalisation. Mutant (e) cuts a footprint at
+three standard deviations, which in this kernel is a limit of the exponent and not a square; mutant (g) takes
+the position in the camera in float32 where pixels are float32; mutant (h) forgets the uids, so that rows decide.
+
+Tests that fail before anything is changed cannot notice a change: they are named and left out.
+Needs a compiler and CMake; takes a few minutes per mutant. Set GRAINGS_ISA to choose the instruction set that tests run
+with where they do not choose themselves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+COPIED = ("graings", "tests", "CMakeLists.txt", "pyproject.toml")
+SOURCE = "graings/kernel/csrc"
+RASTER = ("tests/raster",)
+FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)
+
+# An installed package may be found by an import finder of its own, before the working folder: without it.
+RUN_PYTEST = """
+import sys
+sys.meta_path = [finder for finder in sys.meta_path if "ScikitBuild" not in type(finder).__name__]
+sys.path.insert(0, sys.argv[1])
+import graings
+assert graings.__file__.startswith(sys.argv[1]), graings.__file__
+import pytest
+sys.exit(pytest.main(sys.argv[2:]))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Mutant:
+    name: str
+    what: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...] = RASTER
+
+    @property
+    def needs_build(self) -> bool:
+        return self.file.startswith(SOURCE)
+
+
+GEOMETRY, TILES, FRAME = f"{SOURCE}/geometry.hpp", f"{SOURCE}/tiles.hpp", f"{SOURCE}/frame.cpp"
+
+MUTANTS = (
+    Mutant(
+        "a",
+        "determinant as a c - b b",
+        GEOMETRY,
+        "fma(h, h, fma(h, xx + yy, dot3(cross, cross)))",
+        "(xx + h) * (yy + h) - xy * xy",
+    ),
+    Mutant(
+        "b",
+        "exclusive stop",
+        TILES,
+        "if constexpr (Compat) {",
+        "if constexpr (Compat || true) {",
+    ),
+    Mutant(
+        "c",
+        "factor 2 kept where the ratio is clamped",
+        GEOMETRY,
+        "g_z - iz * (to_x * p.ratio_x + to_y * p.ratio_y)",
+        "g_z - iz * ((g_held_x * p.held_x + fx * g_x * p.ratio_x) + (g_held_y * p.held_y + fy * g_y * p.ratio_y))",
+    ),
+    Mutant("d", "quaternion gradient not projected", GEOMETRY, "(q[i] - radial * p.quat[i])", "(q[i])"),
+    Mutant(
+        "e",
+        "footprint of three standard deviations",
+        GEOMETRY,
+        "fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30))",
+        "fma(level, d8(1 + 1e-5), d8(1e-5)), d8(4.5 * kLog2E))",
+    ),
+    Mutant("f", "slope missing in the gradient of y", GEOMETRY, "g_y = p.slope * e_r - load", "g_y = d8(0) - load"),
+    Mutant(
+        "g",
+        "geometry in float32",
+        GEOMETRY,
+        "    p.z = camera[2];\n",
+        """    if constexpr (sizeof(R) == 4) {
+        double from[3][kGroup], to[kGroup];
+        for (int i = 0; i < 3; i++) store(from[i], away[i]);
+        for (int i = 0; i < 3; i++) {
+            for (int lane = 0; lane < kGroup; lane++) {
+                float sum = 0;
+                for (int j = 0; j < 3; j++) sum += float(k.rotation[3 * i + j]) * float(from[j][lane]);
+                to[lane] = double(sum);
+            }
+            camera[i] = load<kGroup>(to);
+        }
+    }
+    p.z = camera[2];
+""",
+    ),
+    Mutant(
+        "h",
+        "ties of depth decided by the row",
+        FRAME,
+        "std::tuple(depths[a.id], uids[a.id], a.id) < std::tuple(depths[b.id], uids[b.id], b.id)",
+        "std::tuple(depths[a.id], uids[0], a.id) < std::tuple(depths[b.id], uids[0], b.id)",
+    ),
+    Mutant(
+        "i",
+        "times in float32 before they are normalised",
+        "graings/units.py",
+        "(float(time) - self.time_start)",
+        "(float(np.float32(time)) - self.time_start)",
+        ("tests/capture/test_normalize.py",),
+    ),
+    Mutant(
+        "slope-halved",
+        "gradient of the slope halved",
+        GEOMETRY,
+        "g_slope = -(load<kGroup>(sums[kRS])",
+        "g_slope = -(d8(0.5) * load<kGroup>(sums[kRS])",
+    ),
+    Mutant(
+        "cap-passed",
+        "gradient passed through the cap of alpha",
+        TILES,
+        "passing = max(signed_weight, zero);",
+        "passing = max(signed_weight, zero - signed_weight);",
+    ),
+    Mutant(
+        "j-dropped",
+        "no gradient through the last column of the Jacobian",
+        GEOMETRY,
+        "g_held_x = -(fx * iz * j02), g_held_y = -(fy * iz * j12);",
+        "g_held_x = d8(0) * j02, g_held_y = d8(0) * j12;",
+    ),
+    Mutant(
+        "background",
+        "background missing behind the last Gaussian",
+        TILES,
+        "sum_ = fma(g, p16(args.background[c]), sum_);",
+        "sum_ = fma(g, p16(R(0)), sum_);",
+    ),
+)
+
+
+class Copy:
+    """The package in a folder of its own, where it may be changed, built and tested."""
+
+    def __init__(self, folder: Path, jobs: int) -> None:
+        self.folder, self.jobs = folder, jobs
+        for name in COPIED:
+            source, target = ROOT / name, folder / name
+            if source.is_dir():
+                shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "_kernel*"))
+            else:
+                shutil.copy2(source, target)
+        self._run(
+            "cmake", "-S", ".", "-B", "build", "-DCMAKE_BUILD_TYPE=Release", f"-DPython_EXECUTABLE={sys.executable}"
+        )
+
+    def build(self) -> None:
+        self._run("cmake", "--build", "build", "--target", "_kernel", "--parallel", str(self.jobs))
+        for module in (self.folder / "build").glob("_kernel*.so"):
+            shutil.copy2(module, self.folder / "graings/kernel")
+
+    def apply(self, mutant: Mutant) -> str:
+        """Change the source; returns what it was. Raises `SystemExit` where the text is not there once."""
+        path = self.folder / mutant.file
+        before = path.read_text(encoding="utf-8")
+        if (count := before.count(mutant.old)) != 1:
+            raise SystemExit(f"mutant {mutant.name}: its text occurs {count} times in {mutant.file}, expected once")
+        path.write_text(before.replace(mutant.old, mutant.new), encoding="utf-8")
+        return before
+
+    def failures(self, tests: Sequence[str], *options: str) -> list[str]:
+        """Ids of the tests that fail. Raises `SystemExit` where they could not be run at all."""
+        command = [sys.executable, "-c", RUN_PYTEST, str(self.folder), "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+        ran = subprocess.run([*command, *options, *tests], cwd=self.folder, capture_output=True, text=True, check=False)
+        failed = FAILED.findall(ran.stdout)
+        if ran.returncode not in (0, 1) or (ran.returncode == 1) != bool(failed):
+            raise SystemExit(f"pytest could not run:\n{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}")
+        return failed
+
+    def _run(self, *command: str) -> None:
+        ran = subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False)
+        if ran.returncode != 0:
+            raise SystemExit(f"{' '.join(command)} failed:\n{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}")
+
+
+def chosen(only: str | None) -> list[Mutant]:
+    if only is None:
+        return list(MUTANTS)
+    known = {mutant.name: mutant for mutant in MUTANTS}
+    names = only.split(",")
+    if unknown := [name for name in names if name not in known]:
+        raise SystemExit(f"no mutant {', '.join(unknown)}; there are {', '.join(known)}")
+    return [known[name] for name in names]
+
+
+def check_texts(mutants: Sequence[Mutant]) -> None:
+    """Before hours are spent: every text occurs once."""
+    for mutant in mutants:
+        if (count := (ROOT / mutant.file).read_text(encoding="utf-8").count(mutant.old)) != 1:
+            raise SystemExit(f"mutant {mutant.name}: its text occurs {count} times in {mutant.file}, expected once")
+
+
+def try_mutants(copy: Copy, mutants: Sequence[Mutant]) -> dict[str, str | None]:
+    """The first test that notices each mutant, None where none does."""
+    copy.build()
+    tests = sorted({test for mutant in mutants for test in mutant.tests})
+    broken = copy.failures(tests)
+    for test in broken:
+        print(f"fails already, left out: {test}", flush=True)
+    deselected = [f"--deselect={test}" for test in broken]
+    noticed: dict[str, str | None] = {}
+    built_as_is = True
+    for mutant in mutants:
+        before = copy.apply(mutant)
+        if mutant.needs_build or not built_as_is:
+            copy.build()
+            built_as_is = not mutant.needs_build
+        failed = copy.failures(mutant.tests, "-x", *deselected)
+        (copy.folder / mutant.file).write_text(before, encoding="utf-8")
+        noticed[mutant.name] = failed[0] if failed else None
+        print(f"{mutant.name:13} {mutant.what:52} {noticed[mutant.name] or 'SURVIVED'}", flush=True)
+    return noticed
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", metavar="NAMES", help="these mutants, separated by commas")
+    parser.add_argument("--list", action="store_true", help="print the mutants and check that their texts are there")
+    parser.add_argument(
+        "--keep", type=Path, metavar="DIR", help="work in this folder, which must not exist, and keep it"
+    )
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at a time")
+    options = parser.parse_args()
+    mutants = chosen(options.only)
+    check_texts(mutants)
+    if options.list:
+        for mutant in mutants:
+            print(f"{mutant.name:13} {mutant.what:52} {mutant.file}")
+        return 0
+    if options.keep is not None:
+        options.keep.mkdir(parents=True)
+        noticed = try_mutants(Copy(options.keep.resolve(), options.jobs), mutants)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            noticed = try_mutants(Copy(Path(folder).resolve(), options.jobs), mutants)
+    survivors = [name for name, test in noticed.items() if test is None]
+    print(
+        f"{len(noticed) - len(survivors)} of {len(noticed)} noticed"
+        + (f"; survived: {', '.join(survivors)}" * bool(survivors))
+    )
+    return 1 if survivors else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
