@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from graings.camera import Camera, View
-from graings.config import SceneConfig, TrainConfig
+from graings.config import SceneConfig, TrainConfig, restored
 from graings.errors import CheckpointError
 from graings.run_folder import CHECKPOINTS, FACTS_FILE, checkpoints
 from graings.run_folder import newest_checkpoint as newest_checkpoint  # part of this module's interface too
@@ -130,9 +130,9 @@ def load_model(path: Path) -> Model:
     folder = _resolve(path)
     facts = _read_facts(folder)
     try:
-        config = TrainConfig.model_validate(facts["config"])
+        config = restored(TrainConfig, facts["config"], folder)
         scene = _scene_from(
-            load_file(folder / _SCENE_FILE), SceneConfig.model_validate(facts["scene_config"]), facts["temporal"]
+            load_file(folder / _SCENE_FILE), restored(SceneConfig, facts["scene_config"], folder), facts["temporal"]
         )
         units = facts["units"]
         return Model(

@@ -7,11 +7,12 @@ run keeps its shape. Knows nothing of how the numbers are used.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from graings.errors import ConfigError
+from graings.errors import CheckpointError, ConfigError
 
 PAPER_ITERATIONS = 30_000
 
@@ -20,6 +21,9 @@ class Part(BaseModel):
     """Strict base of all parts: unknown fields and non-finite numbers are refused; values are frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+Stored = TypeVar("Stored", bound=Part)
 
 
 class CaptureConfig(Part):
@@ -191,8 +195,22 @@ def make_config(preset: str = "standard", overrides: dict[str, Any] | None = Non
     try:
         return TrainConfig.model_validate(values)
     except ValidationError as error:
-        problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise ConfigError(f"{problems}. `graings options` lists every field with its bounds.") from error
+        raise ConfigError(f"{_problems(error)}. `graings options` lists every field with its bounds.") from error
+
+
+def restored(kind: type[Stored], values: Any, source: Path) -> Stored:
+    """Options as a file of ours holds them. Raises `CheckpointError` naming the file and the fields it got wrong."""
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise CheckpointError(
+            f"{source}: its options are not those of this version ({_problems(error)}). "
+            "Use the version that wrote it, or train again."
+        ) from error
+
+
+def _problems(error: ValidationError) -> str:
+    return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
 
 
 def _merge(into: dict[str, Any], values: dict[str, Any]) -> None:

@@ -25,7 +25,7 @@ from graings.checkpoint import (
     save_checkpoint,
     scene_bytes,
 )
-from graings.config import TrainConfig
+from graings.config import TrainConfig, restored
 from graings.errors import CheckpointError
 from graings.evaluation import evaluate, frames_per_second, subset
 from graings.machine import machine_facts, version_facts
@@ -114,7 +114,7 @@ class TrainingRun:
             facts = json.loads((folder / "run.json").read_text())
         except (OSError, ValueError) as error:
             raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
-        config = TrainConfig.model_validate(facts["config"])
+        config = restored(TrainConfig, facts.get("config"), folder / "run.json")
         clock = Clock()
         started = time.perf_counter()
         data = load_capture(capture or Path(facts["capture"]["path"]), config.capture)

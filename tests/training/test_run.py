@@ -223,3 +223,15 @@ def test_every_ablation_of_the_paper_trains_and_renders(
     reports = list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=30, **ablation)))
     assert reports[-1].evaluation is not None
     assert reports[-1].evaluation.psnr > 8
+
+
+def test_options_of_another_version_are_named_and_not_taken_for_damage(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config(iterations=2))
+    list(run)
+    for path in (tmp_path / "run" / "run.json", *(tmp_path / "run").glob("checkpoints/*/checkpoint.json")):
+        facts = json.loads(path.read_text())
+        facts["config"]["scene"]["gone_since"] = 8
+        path.write_text(json.dumps(facts))
+    for read in (TrainingRun.resume, load_model):
+        with pytest.raises(CheckpointError, match=r"scene\.gone_since.*Use the version that wrote it"):
+            read(tmp_path / "run")
