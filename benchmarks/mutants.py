@@ -62,7 +62,8 @@ class Mutant:
         return self.file.startswith(SOURCE)
 
 
-GEOMETRY, TILES, FRAME = f"{SOURCE}/geometry.hpp", f"{SOURCE}/tiles.hpp", f"{SOURCE}/frame.cpp"
+GEOMETRY, FRAME = f"{SOURCE}/geometry.hpp", f"{SOURCE}/frame.cpp"
+TILES, TILE_GRADIENT = f"{SOURCE}/tiles.hpp", f"{SOURCE}/tile_gradient.hpp"
 
 MUTANTS = (
     Mutant(
@@ -140,7 +141,7 @@ MUTANTS = (
     Mutant(
         "cap-passed",
         "gradient passed through the cap of alpha",
-        TILES,
+        TILE_GRADIENT,
         "passing = max(signed_weight, zero);",
         "passing = max(signed_weight, zero - signed_weight);",
     ),
@@ -154,7 +155,7 @@ MUTANTS = (
     Mutant(
         "background",
         "background missing behind the last Gaussian",
-        TILES,
+        TILE_GRADIENT,
         "sum_ = fma(g, p16(args.background[c]), sum_);",
         "sum_ = fma(g, p16(R(0)), sum_);",
     ),

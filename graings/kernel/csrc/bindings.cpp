@@ -17,7 +17,8 @@
 #include "children.hpp"
 #include "frame.hpp"
 #include "isa.hpp"
-#include "network.hpp"
+#include "perceptron.hpp"
+#include "photometric.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;

@@ -12,7 +12,7 @@ struct Anchors {
 };
 
 // row [drawn, features + 3 + slots]: feature, offset, and a one at the child's slot; centre [drawn, 3] = place +
-// exp(log_scale) * offset; base [drawn, 3] = log_scale. Throws std::invalid_argument when children do not ascend.
+// exp(log_scale) * offset (Eq. 4); base [drawn, 3] = log_scale. Throws std::invalid_argument when children do not ascend.
 template <class R>
 void gather(const Anchors<R>&, int64_t drawn, const int64_t* children, R* row, R* centre, R* base, int threads);
 
@@ -37,7 +37,7 @@ struct Answers {
 };
 
 // mean [drawn, 3] = centre + extent * position; quat [drawn, 4] = unit(1 + canonical) times 1 + rotation;
-// log_scale [drawn, 3] = base + canonical + change, both bounded.
+// log_scale [drawn, 3] = base + canonical + change, both bounded (Eq. 5 and 10).
 template <class R>
 void compose(const Answers<R>&, R* mean, R* quat, R* log_scale, int threads);
 

@@ -287,27 +287,7 @@ void Frame<R>::gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha,
     seconds_[kGeometryGradient] = watch.lap();
 }
 
-template <class R>
-Likeness compare(int64_t height, int64_t width, const R* image, const R* target, Likeness weights, R* gradient, int threads) {
-    constexpr int64_t kBand = 16;  // rows
-    const Kernels<R>& run = kernels<R>();
-    const int64_t bands = pieces_of(height, kBand), row = 3 * width + 2 * 15 + 2 * kLanes;
-    const double scale = 1.0 / (3.0 * double(height) * double(width));
-    Buffer<double> sums{size_t(2 * bands)};
-    Buffer<R> maps(gradient ? size_t(9 * height * width) : 1), scratch(size_t(threads) * size_t(5 * row));
-    const SsimArgs<R> args{height, width, image, target, gradient, gradient ? maps.get() : nullptr, sums.get(), R(weights.similarity * scale), R(weights.absolute * scale)};
-    const auto end = [&](int64_t band) { return std::min(height, (band + 1) * kBand); };
-    parallel_for(threads, bands, [&](int worker, int64_t band) { run.ssim_values(args, band, band * kBand, end(band), scratch.get() + worker * 5 * row); });
-    if (gradient)
-        parallel_for(threads, bands, [&](int worker, int64_t band) { run.ssim_gradient(args, band * kBand, end(band), scratch.get() + worker * 5 * row); });
-    Likeness mean{};
-    for (int64_t band = 0; band < bands; band++) mean.similarity += sums[size_t(2 * band)] * scale, mean.absolute += sums[size_t(2 * band + 1)] * scale;
-    return mean;
-}
-
 template class Frame<float>;
 template class Frame<double>;
-template Likeness compare<float>(int64_t, int64_t, const float*, const float*, Likeness, float*, int);
-template Likeness compare<double>(int64_t, int64_t, const double*, const double*, Likeness, double*, int);
 
 }  // namespace graings

@@ -56,13 +56,4 @@ private:
     Buffer<int32_t> processed_, items_;
 };
 
-struct Likeness {
-    double similarity, absolute;  // means over pixels and channels
-};
-
-// Mean structural similarity and mean absolute difference of two [height, width, 3] images. `gradient`, which may
-// be null, is that of weights.similarity * similarity + weights.absolute * absolute.
-template <class R>
-Likeness compare(int64_t height, int64_t width, const R* image, const R* target, Likeness weights, R* gradient, int threads);
-
 }  // namespace graings

@@ -1,8 +1,9 @@
 // Compiled once per instruction set (CMakeLists.txt defines GRAINGS_ISA and the flags).
 #include <type_traits>
 #include "geometry.hpp"
-#include "perceptron.hpp"
+#include "layers.hpp"
 #include "ssim.hpp"
+#include "tile_gradient.hpp"
 #include "tiles.hpp"
 
 namespace graings {

@@ -1,4 +1,4 @@
-#include "network.hpp"
+#include "perceptron.hpp"
 
 #include <algorithm>
 #include <stdexcept>

@@ -1,0 +1,125 @@
+// A chain of linear layers with ReLU between them, a block of rows at a time, so that what a layer leaves is still
+// in cache when the next one reads it.
+#pragma once
+#include "simd.hpp"
+#include "types.hpp"
+
+namespace graings::GRAINGS_ISA {
+
+#if defined(__AVX512F__) || defined(__aarch64__)
+constexpr int kStripRows = 8;  // 8 x 2 accumulators: enough to hide the latency of two multipliers
+#else
+constexpr int kStripRows = 4;  // 16 registers hold no more
+#endif
+
+// c[kStripRows, vectors] (+)= a b over `depth`; row m of `a` starts at a + m * a_row and advances by a_step.
+template <class R, int vectors, bool add>
+GRAINGS_INLINE void strip(int64_t depth, const R* a, int64_t a_row, int64_t a_step, const R* b, int64_t b_row, R* c, int64_t c_row) {
+    constexpr int width = kNative<R>;
+    Native<R> sums[kStripRows][vectors];
+    for (int m = 0; m < kStripRows; m++)
+        for (int v = 0; v < vectors; v++) {
+            if constexpr (add) std::memcpy(&sums[m][v], c + m * c_row + v * width, sizeof sums[m][v]);
+            else sums[m][v] = Native<R>{};
+        }
+    for (int64_t k = 0; k < depth; k++) {
+        Native<R> row[vectors];
+        for (int v = 0; v < vectors; v++) std::memcpy(&row[v], b + k * b_row + v * width, sizeof row[v]);
+        for (int m = 0; m < kStripRows; m++) {
+            const Native<R> factor = splat<R, width>(a[m * a_row + k * a_step]).v;
+            for (int v = 0; v < vectors; v++) sums[m][v] = fused(factor, row[v], sums[m][v]);
+        }
+    }
+    for (int m = 0; m < kStripRows; m++)
+        for (int v = 0; v < vectors; v++) std::memcpy(c + m * c_row + v * width, &sums[m][v], sizeof sums[m][v]);
+}
+
+// c[rows, columns] (+)= a b. `rows` is a multiple of kStripRows and `columns` of kNetworkPad.
+template <class R, bool add>
+GRAINGS_INLINE void multiply(int64_t rows, int64_t columns, int64_t depth, const R* a, int64_t a_row, int64_t a_step, const R* b, int64_t b_row, R* c, int64_t c_row) {
+    constexpr int64_t width = kNative<R>;
+    int64_t column = 0;
+    for (; column + 2 * width <= columns; column += 2 * width)
+        for (int64_t m = 0; m < rows; m += kStripRows) strip<R, 2, add>(depth, a + m * a_row, a_row, a_step, b + column, b_row, c + m * c_row + column, c_row);
+    for (; column < columns; column += width)
+        for (int64_t m = 0; m < rows; m += kStripRows) strip<R, 1, add>(depth, a + m * a_row, a_row, a_step, b + column, b_row, c + m * c_row + column, c_row);
+}
+
+GRAINGS_INLINE int64_t whole_strips(int64_t rows) { return (rows + kStripRows - 1) / kStripRows * kStripRows; }
+
+// Rows [begin, begin + rows) of `from` [., width] into `to` [., padded], zeros behind.
+template <class R>
+GRAINGS_INLINE void take_rows(const R* from, int64_t begin, int64_t rows, int64_t width, R* to, int64_t padded) {
+    for (int64_t r = 0; r < rows; r++) {
+        std::memcpy(to + r * padded, from + (begin + r) * width, sizeof(R) * size_t(width));
+        std::memset(to + r * padded + width, 0, sizeof(R) * size_t(padded - width));
+    }
+}
+
+// Where the activations of the block that begins at `row` lie.
+template <class R>
+GRAINGS_INLINE void place(const NetworkArgs<R>& args, int64_t row, R* scratch, R** levels) {
+    for (int l = 0; l <= args.layers; l++) levels[l] = scratch + args.offsets[l];
+    if (!args.hidden) return;
+    R* block = args.hidden + row / kNetworkRows * (args.offsets[args.layers] - args.offsets[1]);
+    for (int l = 1; l < args.layers; l++) levels[l] = block + (args.offsets[l] - args.offsets[1]);
+}
+
+// Output rows [begin, end). A NaN stays one through ReLU.
+template <class R>
+static void network_values(const NetworkArgs<R>& args, int64_t begin, int64_t end, R* scratch) {
+    constexpr int width = kNative<R>;
+    const auto zero = splat<R, width>(R(0));
+    R* levels[kMaxLayers + 1];
+    for (int64_t row = begin; row < end; row += kNetworkRows) {
+        const int64_t rows = end - row < kNetworkRows ? end - row : kNetworkRows, strips = whole_strips(rows);
+        place(args, row, scratch, levels);
+        take_rows(args.input, row, rows, args.widths[0], levels[0], args.padded[0]);
+        for (int l = 0; l < args.layers; l++) {
+            const int64_t in = args.padded[l], out = args.padded[l + 1];
+            R* to = levels[l + 1];
+            for (int64_t r = 0; r < strips; r++) std::memcpy(to + r * out, args.biases[l], sizeof(R) * size_t(out));
+            multiply<R, true>(strips, out, args.widths[l], levels[l], in, 1, args.forward[l], out, to, out);
+            if (l + 1 < args.layers)
+                for (int64_t i = 0; i < strips * out; i += width) store(to + i, max(zero, load<width>(to + i)));
+        }
+        const int64_t last = args.widths[args.layers];
+        for (int64_t r = 0; r < rows; r++) std::memcpy(args.output + (row + r) * last, levels[args.layers] + r * args.padded[args.layers], sizeof(R) * size_t(last));
+    }
+}
+
+// Gradients of rows [begin, end): the input's go to their place, those of weights and biases are added to `sums`.
+template <class R>
+static void network_gradient(const NetworkArgs<R>& args, int64_t begin, int64_t end, R* sums, R* scratch) {
+    constexpr int width = kNative<R>;
+    R* levels[kMaxLayers + 1];
+    R *above = scratch + args.offsets[args.layers + 1], *below = above + args.widest * kNetworkRows;
+    for (int64_t row = begin; row < end; row += kNetworkRows) {
+        const int64_t rows = end - row < kNetworkRows ? end - row : kNetworkRows, strips = whole_strips(rows);
+        place(args, row, scratch, levels);
+        take_rows(args.input, row, rows, args.widths[0], levels[0], args.padded[0]);
+        take_rows(args.v_output, row, rows, args.widths[args.layers], above, args.padded[args.layers]);
+        for (int l = args.layers - 1; l >= 0; l--) {
+            const int64_t in = args.padded[l], out = args.padded[l + 1];
+            R *weight = sums + args.weight_at[l], *bias = sums + args.bias_at[l];
+            multiply<R, true>(out, in, rows, above, 1, out, levels[l], in, weight, in);
+            for (int64_t c = 0; c < out; c += width) {
+                auto sum = load<width>(bias + c);
+                for (int64_t r = 0; r < rows; r++) sum = sum + load<width>(above + r * out + c);
+                store(bias + c, sum);
+            }
+            if (l == 0 && !args.v_input) break;
+            multiply<R, false>(strips, in, args.widths[l + 1], above, out, 1, args.backward[l], in, below, in);
+            if (l == 0) {
+                for (int64_t r = 0; r < rows; r++) std::memcpy(args.v_input + (row + r) * args.widths[0], below + r * in, sizeof(R) * size_t(args.widths[0]));
+                break;
+            }
+            const auto zero = splat<R, width>(R(0));
+            for (int64_t i = 0; i < rows * in; i += width) store(below + i, select(load<width>(levels[l] + i) <= zero, zero, load<width>(below + i)));
+            R* done = above;
+            above = below, below = done;
+        }
+    }
+}
+
+}  // namespace graings::GRAINGS_ISA
