@@ -91,7 +91,7 @@ def in_turn(rounds: int, calls: dict[str, Call]) -> dict[str, list[float]]:
     times: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds + 2):
         for name, call in calls.items():
-            time.sleep(0.005)  # threads of the call before may still spin in wait for more
+            time.sleep(0.03)  # threads of the call before may still spin for 10 ms in wait for more
             start = time.perf_counter()
             call()
             times[name].append(1e3 * (time.perf_counter() - start))

@@ -141,7 +141,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         .def("gradient",
              [](const Frame<R>& frame, In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, std::optional<In<R>> offset, In<R> background,
                 int64_t height, int64_t width, In<R> v_color, std::optional<In<R>> v_alpha, std::optional<In<R>> v_depth, Out<R> g_means, Out<R> g_quats, Out<R> g_log_scales,
-                Out<R> g_opacities, Out<R> g_colors, Out<R> g_background, std::optional<Out<R>> g_offset, int threads) {
+                Out<R> g_opacities, Out<R> g_colors, std::optional<Out<R>> g_background, std::optional<Out<R>> g_offset, int threads) {
                  const auto in = inputs<R>(means, quats, log_scales, opacities, colors, offset, background);
                  const size_t n = size_t(in.count), pixels = size_t(height * width);
                  const R* upstream = checked(v_color, 3 * pixels, "v_color");

@@ -13,11 +13,18 @@ struct Outputs {
 
 template <class R>
 struct Gradients {
-    R *means, *quats, *log_scales, *opacities, *colors, *background, *offset;  // offset may be null
+    R *means, *quats, *log_scales, *opacities, *colors, *background, *offset;  // the last two may be null
 };
 
 struct DepthKey {
     uint32_t key, id;
+};
+
+// What is known of a run of Gaussians once they are projected.
+struct Piece {
+    int64_t begin = 0, end = 0, tiled = 0, pairs = 0;  // tiled: those that touch a tile
+    uint64_t least = ~uint64_t(0), most = 0;           // of their depths, as bits
+    int64_t statuses[kStatuses] = {};
 };
 
 enum Stage { kProject, kSort, kBin, kBlend, kBlendGradient, kGeometryGradient, kStages };
@@ -37,14 +44,14 @@ public:
     const double* seconds() const { return seconds_; }  // per Stage
 
 private:
-    void project(const ProjectArgs<R>&, std::vector<std::vector<uint32_t>>& lists, std::vector<int64_t>& counts, int threads);
-    std::vector<DepthKey> sorted(const double* depths, const int64_t* uids, int threads);
-    void bin(const std::vector<DepthKey>& order, const std::vector<std::vector<uint32_t>>& lists, const std::vector<int64_t>& counts, int threads);
+    std::vector<Piece> project(const ProjectArgs<R>&, int threads);
+    Buffer<DepthKey> sorted(const std::vector<Piece>&, const double* depths, const int64_t* uids, int threads);
+    void bin(const Buffer<DepthKey>& order, int threads);
     TileArgs<R> tile_args(const R* background) const;
 
     Camera camera_;
     Settings settings_;
-    int64_t count_, tiles_, pairs_ = 0;
+    int64_t count_, tiles_, pairs_ = 0, tiled_ = 0;
     int64_t statuses_[kStatuses] = {};
     mutable double seconds_[kStages] = {};
     Buffer<uint8_t> status_;
@@ -54,6 +61,7 @@ private:
     Buffer<uint32_t> ids_, slots_;
     Buffer<uint16_t> masks_;
     Buffer<int32_t> processed_, items_;
+    Buffer<R> light_, last_;
 };
 
 }  // namespace graings

@@ -10,6 +10,7 @@ constexpr int kGroup = 8;
 using D = Vec<double, kGroup>;
 GRAINGS_INLINE D d8(double x) { return splat<double, kGroup>(x); }
 
+constexpr double kRootHalfLog2E = 0.8493218002880191;  // sqrt(log2(e) / 2)
 constexpr double kLn2 = 0.6931471805599453;
 constexpr double kLog2E = 1.4426950408889634;
 
@@ -20,7 +21,7 @@ struct Projected {
     D rotation[9], scale[3];
     D affine[6];      // Jacobian times world-to-camera rotation, 2x3
     D m1[3], m2[3];   // rows of the factor of the covariance
-    D x, y, slope, v, c, a;
+    D x, y, slope, v, c, inverse_c, a;
     D finite;         // 0, or not a number
 };
 
@@ -36,25 +37,95 @@ GRAINGS_INLINE Limits limits(const Camera& k, const Settings& s) {
 
 GRAINGS_INLINE D dot3(const D* a, const D* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
 
-// Column `column` of a row-major [N, width] array for Gaussians begin..begin+7; past the end the last one repeats.
-template <class R>
-GRAINGS_INLINE D gather(const R* rows, int width, int column, int64_t begin, int64_t count) {
-    double lanes[kGroup];
-    for (int i = 0; i < kGroup; i++) {
-        const int64_t row = begin + i < count ? begin + i : count - 1;
-        lanes[i] = double(rows[row * width + column]);
+#if defined(__AVX512F__)
+// Where number k of eight rows of W lies among their columns, each of eight numbers, or the other way round.
+template <int W, bool ToRows>
+struct Places {
+    alignas(64) int32_t at[(8 * W + 15) / 16 * 16] = {};
+    constexpr Places() {
+        for (int k = 0; k < 8 * W; k++) at[k] = ToRows ? k % W * 8 + k / W : k % 8 * W + k / 8;
     }
-    return load<kGroup>(lanes);
+};
+// The numbers of up to two registers in another order, in the `part`-th register.
+template <int W, bool ToRows>
+GRAINGS_INLINE __m512 reordered(__m512 a, __m512 b, int part) {
+    static constexpr Places<W, ToRows> places;
+    const __m512i at = _mm512_load_si512(places.at + 16 * part);
+    return 8 * W > 16 ? _mm512_permutex2var_ps(a, at, b) : _mm512_permutexvar_ps(at, a);
+}
+#endif
+
+// The columns of a row-major [N, W] array for Gaussians begin..begin+7; past the end the last one repeats.
+template <int W, class R>
+GRAINGS_INLINE void columns_of(const R* rows, int64_t begin, int64_t count, D* columns) {
+    if constexpr (W == 1)
+        if (begin + kGroup <= count) {
+            columns[0] = load_as<kGroup>(rows + begin);
+            return;
+        }
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4)
+        if (begin + kGroup <= count) {
+            constexpr int second = 8 * W - 16;
+            const float* p = rows + begin * W;
+            const __m512 a = W == 1 ? _mm512_castps256_ps512(_mm256_loadu_ps(p)) : _mm512_loadu_ps(p);
+            const __m512 b = second <= 0 ? a : second == 8 ? _mm512_castps256_ps512(_mm256_loadu_ps(p + 16)) : _mm512_loadu_ps(p + 16);
+            for (int part = 0; part < (W + 1) / 2; part++) {
+                const __m512 pair = W == 1 ? a : reordered<W, false>(a, b, part);
+                columns[2 * part].v = (Native<double>)_mm512_cvtps_pd(_mm512_castps512_ps256(pair));
+                if (2 * part + 1 < W) columns[2 * part + 1].v = (Native<double>)_mm512_cvtps_pd(_mm512_extractf32x8_ps(pair, 1));
+            }
+            return;
+        }
+#endif
+    R lanes[W][kGroup];
+    for (int i = 0; i < kGroup; i++) {
+        const R* row = rows + (begin + i < count ? begin + i : count - 1) * W;
+        for (int c = 0; c < W; c++) lanes[c][i] = row[c];
+    }
+    for (int c = 0; c < W; c++) columns[c] = load_as<kGroup>(lanes[c]);
+}
+
+// The way back, rounded to R, for those before the end.
+template <int W, class R>
+GRAINGS_INLINE void store_columns(R* rows, int64_t begin, int64_t end, const D* columns) {
+    if constexpr (W == 1)
+        if (begin + kGroup <= end) {
+            store_as<R>(rows + begin, columns[0]);
+            return;
+        }
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4)
+        if (begin + kGroup <= end) {
+            const auto two = [&](int c) {
+                const __m256 low = _mm512_cvtpd_ps((__m512d)columns[c].v), high = c + 1 < W ? _mm512_cvtpd_ps((__m512d)columns[c + 1 < W ? c + 1 : c].v) : low;
+                return _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1);
+            };
+            const __m512 a = two(0), b = W > 2 ? two(2) : a;
+            for (int part = 0; part < (W + 1) / 2; part++) {
+                const __m512 ordered = W == 1 ? a : reordered<W, true>(a, b, part);
+                float* p = rows + begin * W + 16 * part;
+                if (8 * W - 16 * part >= 16) _mm512_storeu_ps(p, ordered);
+                else _mm256_storeu_ps(p, _mm512_castps512_ps256(ordered));
+            }
+            return;
+        }
+#endif
+    R lanes[W][kGroup];
+    for (int c = 0; c < W; c++) store_as<R>(lanes[c], columns[c]);
+    for (int i = 0; i < kGroup && begin + i < end; i++)
+        for (int c = 0; c < W; c++) rows[(begin + i) * W + c] = lanes[c][i];
 }
 
 template <class R>
 GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings, const Inputs<R>& in, int64_t begin) {
     Projected p;
     D mean[3], rho[3], offset[2];
-    for (int i = 0; i < 3; i++) mean[i] = gather(in.means, 3, i, begin, in.count);
-    for (int i = 0; i < 3; i++) rho[i] = gather(in.log_scales, 3, i, begin, in.count);
-    for (int i = 0; i < 4; i++) p.quat[i] = gather(in.quats, 4, i, begin, in.count);
-    for (int i = 0; i < 2; i++) offset[i] = in.offset ? gather(in.offset, 2, i, begin, in.count) : d8(0);
+    columns_of<3>(in.means, begin, in.count, mean);
+    columns_of<3>(in.log_scales, begin, in.count, rho);
+    columns_of<4>(in.quats, begin, in.count, p.quat);
+    offset[0] = offset[1] = d8(0);
+    if (in.offset) columns_of<2>(in.offset, begin, in.count, offset);
     p.finite = d8(0);
     for (int i = 0; i < 3; i++) p.finite = p.finite + (mean[i] - mean[i]) + (rho[i] - rho[i]);
     for (int i = 0; i < 2; i++) p.finite = p.finite + (offset[i] - offset[i]);
@@ -66,8 +137,8 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
         camera[i] = fma(d8(k.rotation[3 * i]), away[0], fma(d8(k.rotation[3 * i + 1]), away[1], d8(k.rotation[3 * i + 2]) * away[2]));
     p.z = camera[2];
     p.inverse_z = d8(1) / p.z;
-    p.ratio_x = camera[0] / p.z;
-    p.ratio_y = camera[1] / p.z;
+    p.ratio_x = camera[0] * p.inverse_z;
+    p.ratio_y = camera[1] * p.inverse_z;
     const Limits limit = limits(k, settings);
     p.held_x = clamp(p.ratio_x, limit.low_x, limit.high_x);
     p.held_y = clamp(p.ratio_y, limit.low_y, limit.high_y);
@@ -100,11 +171,51 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
     const D determinant = fma(h, h, fma(h, xx + yy, dot3(cross, cross)));  // Lagrange's identity
     p.a = xx + h;
     p.c = yy + h;
-    p.slope = xy / p.c;
-    p.v = determinant / p.c;
+    p.inverse_c = d8(1) / p.c;
+    p.slope = xy * p.inverse_c;
+    p.v = determinant * p.inverse_c;
     p.x = fma(d8(k.fx), p.ratio_x, d8(k.cx)) + offset[0];
     p.y = fma(d8(k.fy), p.ratio_y, d8(k.cy)) + offset[1];
     return p;
+}
+
+#if defined(__AVX512F__)
+// Eight records from their columns: numbers of float64, and pairs of single precision that fill as much.
+GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*pairs)[2]) {
+    __m512d column[8];
+    for (int c = 0; c < 3; c++) column[c] = (__m512d)whole[c].v;
+    const __m512i alternate = _mm512_setr_epi32(0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15);
+    for (int c = 3; c < 8; c++) {
+        const __m256 low = _mm512_cvtpd_ps((__m512d)pairs[c - 3][0].v), high = _mm512_cvtpd_ps((__m512d)pairs[c - 3][1].v);
+        column[c] = _mm512_castps_pd(_mm512_permutexvar_ps(alternate, _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1)));
+    }
+    for (int odd = 0; odd < 2; odd++) {
+        __m512d two[4];  // columns 2k, 2k + 1 of rows 2m + odd, in quarter m
+        for (int k = 0; k < 4; k++) two[k] = odd ? _mm512_unpackhi_pd(column[2 * k], column[2 * k + 1]) : _mm512_unpacklo_pd(column[2 * k], column[2 * k + 1]);
+        const __m512d a = _mm512_shuffle_f64x2(two[0], two[1], 0x44), b = _mm512_shuffle_f64x2(two[2], two[3], 0x44);
+        const __m512d c = _mm512_shuffle_f64x2(two[0], two[1], 0xEE), d = _mm512_shuffle_f64x2(two[2], two[3], 0xEE);
+        _mm512_storeu_pd(to + odd, _mm512_shuffle_f64x2(a, b, 0x88)), _mm512_storeu_pd(to + 2 + odd, _mm512_shuffle_f64x2(a, b, 0xDD));
+        _mm512_storeu_pd(to + 4 + odd, _mm512_shuffle_f64x2(c, d, 0x88)), _mm512_storeu_pd(to + 6 + odd, _mm512_shuffle_f64x2(c, d, 0xDD));
+    }
+}
+#endif
+
+// Records of Gaussians begin..begin+7, as far as they come before the end.
+template <class R>
+GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, const D* whole, const D (*pairs)[2]) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4)
+        if (begin + kGroup <= end) {
+            store_records(records + begin, whole, pairs);
+            return;
+        }
+#endif
+    double x[3][kGroup];
+    R y[10][kGroup];
+    for (int c = 0; c < 3; c++) store(x[c], whole[c]);
+    for (int c = 0; c < 10; c++) store_as<R>(y[c], pairs[c / 2][c % 2]);
+    for (int i = 0; i < kGroup && begin + i < end; i++)
+        records[begin + i] = {x[0][i], x[1][i], x[2][i], y[0][i], y[1][i], y[2][i], y[3][i], y[4][i], y[5][i], y[6][i], y[7][i], y[8][i], y[9][i]};
 }
 
 template <class R>
@@ -112,58 +223,76 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
     const Settings& s = args.settings;
     const Inputs<R>& in = args.in;
     const double width = double(args.camera.width), height = double(args.camera.height);
+    const D half = d8(0.5), zero = d8(0), one = d8(1), w = d8(width), h = d8(height);
     for (int64_t group = begin; group < end; group += kGroup) {
         const Projected p = project_group(args.camera, s, in, group);
+        D opacity, color[3];
+        columns_of<1>(in.opacities, group, in.count, &opacity);
+        columns_of<3>(in.colors, group, in.count, color);
         const D footprint = (p.x - p.x) + (p.y - p.y) + (p.slope - p.slope) + (p.v - p.v) + (p.c - p.c) + (p.a - p.a);
-        const D sr = sqrt(d8(0.5 * kLog2E) / p.v), sy = sqrt(d8(0.5 * kLog2E) / p.c);
-        // Beyond `level` nothing is drawn. The pixel decides; extents only save work, so they are widened by more than
-        // any rounding of the exponent.
-        const D level = s.alpha_min > 0 ? log2(gather(in.opacities, 1, 0, group, in.count) / d8(s.alpha_min)) : d8(1e30);
-        const D widened = min(fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30)), tilt = p.slope * sr / sy, root = sqrt(widened);
-        const D high = root / sy, wide = root * sqrt(fma(tilt, tilt, d8(1))) / sr;
-        double finite[8], bounded[8], squared[8], z[8], x[8], y[8], slope[8], a[8], c[8], sr_[8], sy_[8], level_[8], widened_[8], high_[8], wide_[8];
-        double largest[8];
-        store(largest, max(max(p.scale[0], p.scale[1]), max(p.scale[2], abs(p.z))));
-        store(level_, level), store(widened_, widened), store(high_, high), store(wide_, wide);
-        store(finite, p.finite), store(bounded, footprint), store(squared, p.squared), store(z, p.z), store(x, p.x);
-        store(y, p.y), store(slope, p.slope), store(a, p.a), store(c, p.c), store(sr_, sr), store(sy_, sy);
-        for (int lane = 0; lane < kGroup && group + lane < end; lane++) {
-            const int64_t i = group + lane;
-            const double opacity = double(in.opacities[i]);
-            double loose = finite[lane] + (opacity - opacity);
-            for (int channel = 0; channel < 3; channel++) loose += double(in.colors[3 * i + channel]) - double(in.colors[3 * i + channel]);
-            args.means2d[2 * i] = args.means2d[2 * i + 1] = args.radii[2 * i] = args.radii[2 * i + 1] = R(0);
-            if (!(loose == 0 && largest[lane] <= s.far)) { args.status[i] = kNonFinite; continue; }
-            if (!(squared[lane] >= 1e-24)) { args.status[i] = kZeroQuat; continue; }
-            if (!(z[lane] > s.near)) { args.status[i] = kBehind; continue; }
-            if (!(opacity > s.alpha_min)) { args.status[i] = kFaint; continue; }
-            if (!(bounded[lane] == 0)) { args.status[i] = kNonFinite; continue; }
-            double radius_x, radius_y;
-            if (s.compat) {
-                const double covariance = slope[lane] * c[lane], half = 0.5 * (a[lane] - c[lane]);
-                const double largest = 0.5 * (a[lane] + c[lane]) + __builtin_sqrt(half * half + covariance * covariance);
-                radius_x = radius_y = __builtin_ceil(3 * __builtin_sqrt(largest));
-                if (__builtin_floor((x[lane] - radius_x) / kTile) >= __builtin_ceil(width / kTile) || __builtin_ceil((x[lane] + radius_x) / kTile) <= 0 ||
-                    __builtin_floor((y[lane] - radius_y) / kTile) >= __builtin_ceil(height / kTile) || __builtin_ceil((y[lane] + radius_y) / kTile) <= 0 ||
-                    radius_x == 0) { args.status[i] = kOutside; continue; }
-            } else {
-                const double reach = s.alpha_min > 0 ? 2 * kLn2 * level_[lane] : __builtin_inf();
-                radius_x = __builtin_sqrt(reach * a[lane]), radius_y = __builtin_sqrt(reach * c[lane]);
-                if (!(x[lane] - radius_x <= width + 0.5 && x[lane] + radius_x >= -0.5 && y[lane] - radius_y <= height + 0.5 &&
-                      y[lane] + radius_y >= -0.5)) { args.status[i] = kOutside; continue; }
+        const D loose = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
+        const D broad = sqrt(p.a), tall = sqrt(p.c), narrow = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
+        const D sr = unit * narrow / p.v, sy = unit * tall * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
+        // Beyond `level` nothing is drawn. The pixel decides; what follows from it only saves work, so it is widened
+        // by more than any rounding of the exponent.
+        const D level = s.alpha_min > 0 ? log2(opacity * d8(1 / s.alpha_min)) : d8(1e30), root = sqrt(max(level, zero));
+        const D widened = min(fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30));
+        const D flat = radius * tall, fall = d8(2 * kLn2) * p.c * p.v / p.a;
+        const D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
+        // tiles with a pixel's centre in it
+        const auto tile = [](D pixel) { return floor(pixel * d8(1.0 / kTile)); };
+        const D first_x = zero - floor(zero - clamp(p.x - wide - half, zero, w)), last_x = floor(clamp(p.x + wide - half, zero - one, w - one));
+        const D first_y = zero - floor(zero - clamp(p.y - high - half, zero, h)), last_y = floor(clamp(p.y + high - half, zero - one, h - one));
+        const D exact = (s.alpha_min > 0 ? root : d8(__builtin_inf())) * radius;
+        D radii[2] = {exact * broad, exact * tall};
+        double box[4][kGroup];
+        store(box[0], tile(first_x)), store(box[1], tile(last_x)), store(box[2], tile(first_y)), store(box[3], tile(last_y));
+        auto tiled = (first_x <= last_x) & (first_y <= last_y), inside = zero <= zero;
+        if (s.compat) {
+            double x[kGroup], y[kGroup], a[kGroup], c[kGroup], slope[kGroup], square[kGroup], hit[kGroup];
+            store(x, p.x), store(y, p.y), store(a, p.a), store(c, p.c), store(slope, p.slope);
+            for (int i = 0; i < kGroup; i++) {
+                const double covariance = slope[i] * c[i], difference = 0.5 * (a[i] - c[i]);
+                square[i] = __builtin_ceil(3 * __builtin_sqrt(0.5 * (a[i] + c[i]) + __builtin_sqrt(difference * difference + covariance * covariance)));
+                const auto bound = [](double t, double most) { return !(t > 0) ? 0 : t > most ? most : t; };
+                const double across = __builtin_ceil(width / kTile), down = __builtin_ceil(height / kTile);
+                box[0][i] = bound(__builtin_floor((x[i] - square[i]) / kTile), across), box[1][i] = bound(__builtin_ceil((x[i] + square[i]) / kTile), across) - 1;
+                box[2][i] = bound(__builtin_floor((y[i] - square[i]) / kTile), down), box[3][i] = bound(__builtin_ceil((y[i] + square[i]) / kTile), down) - 1;
+                hit[i] = square[i] > 0 && box[0][i] <= box[1][i] && box[2][i] <= box[3][i];
             }
-            args.status[i] = kDrawn;
-            args.depths[i] = z[lane];
-            args.means2d[2 * i] = R(x[lane]), args.means2d[2 * i + 1] = R(y[lane]);
-            args.radii[2 * i] = R(radius_x), args.radii[2 * i + 1] = R(radius_y);
-            args.extents[2 * i] = wide_[lane], args.extents[2 * i + 1] = high_[lane];
-            args.records[i] = {x[lane], y[lane], slope[lane], sr_[lane], sy_[lane], in.opacities[i], in.colors[3 * i],
-                               in.colors[3 * i + 1], in.colors[3 * i + 2], R(z[lane]), R(widened_[lane])};
+            radii[0] = radii[1] = load<kGroup>(square);
+            tiled = inside = zero < load<kGroup>(hit);
+        } else
+            inside = (p.x - radii[0] <= w + half) & (zero - half <= p.x + radii[0]) & (p.y - radii[1] <= h + half) & (zero - half <= p.y + radii[1]);
+
+        const auto is_zero = [&](D t) { return (zero <= t) & (t <= zero); };  // and a number
+        const D largest = max(max(p.scale[0], p.scale[1]), max(p.scale[2], abs(p.z)));
+        const auto finite = is_zero(loose) & (largest <= d8(s.far)), turned = d8(1e-24) <= p.squared, ahead = d8(s.near) < p.z;
+        const auto seen = d8(s.alpha_min) < opacity, bounded = is_zero(footprint);
+        const auto drawn = finite & turned & ahead & seen & bounded & inside;
+        const uint32_t is_drawn = bits(drawn), is_tiled = is_drawn & bits(tiled);
+        const uint32_t is_finite = bits(finite), is_turned = bits(turned), is_ahead = bits(ahead), is_seen = bits(seen), is_bounded = bits(bounded);
+        const D center[2] = {select(drawn, p.x, zero), select(drawn, p.y, zero)};
+        radii[0] = select(drawn, radii[0], zero), radii[1] = select(drawn, radii[1], zero);
+        store_columns<2>(args.means2d, group, end, center), store_columns<2>(args.radii, group, end, radii);
+        store_columns<1>(args.depths, group, end, &p.z);
+        const D whole[3] = {p.x, p.y, p.slope}, pairs[5][2] = {{sr, sy}, {opacity, color[0]}, {color[1], color[2]}, {p.z, widened}, {flat, fall}};
+        put_records(args.records, group, end, whole, pairs);
+        for (int lane = 0; lane < kGroup && group + lane < end; lane++) {
+            const auto is = [&](uint32_t which) { return which >> lane & 1; };
+            args.status[group + lane] = is(is_drawn) ? kDrawn : !is(is_finite) ? kNonFinite : !is(is_turned) ? kZeroQuat : !is(is_ahead) ? kBehind
+                                        : !is(is_seen) ? kFaint : !is(is_bounded) ? kNonFinite : kOutside;
+            Span span{0, 0, 1, 0, 1, 0};
+            if (is(is_tiled)) {
+                const uint32_t l = uint32_t(int32_t(box[0][lane])), r = uint32_t(int32_t(box[1][lane])), t = uint32_t(int32_t(box[2][lane])), b = uint32_t(int32_t(box[3][lane]));
+                span = {0, (r - l + 1) * (b - t + 1), l, r, t, b};
+            }
+            args.spans[group + lane] = span;
         }
     }
 }
 
-// Order of the sums per (tile, Gaussian); ge = dL/de, r and s the scaled distances.
+// Order of the sums per (tile, Gaussian); E: -dL/de of the exponent e, times the scaled distances r and s.
 enum Sum { kE, kR, kS, kRR, kRS, kSS, kRed, kGreen, kBlue, kDepth };
 
 template <class R>
@@ -171,41 +300,45 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
     const Camera& k = args.camera;
     const Inputs<R>& in = args.in;
     for (int64_t group = begin; group < end; group += kGroup) {
-        double sums[kSums][kGroup] = {};
-        double sr_[kGroup], sy_[kGroup], opacity[kGroup];
+        double sums[kGroup][kSlot] = {}, on_[kGroup] = {};
+        R sr_[kGroup], sy_[kGroup], opacity_[kGroup];
         bool drawn = false;
         for (int lane = 0; lane < kGroup; lane++) {
             const int64_t i = group + lane;
-            sr_[lane] = sy_[lane] = opacity[lane] = 1;
+            sr_[lane] = sy_[lane] = opacity_[lane] = 1;
             if (i >= end || args.status[i] != kDrawn) continue;
-            drawn = true;
-            sr_[lane] = args.records[i].sr, sy_[lane] = args.records[i].sy, opacity[lane] = double(in.opacities[i]);
+            drawn = true, on_[lane] = 1;
+            sr_[lane] = args.records[i].sr, sy_[lane] = args.records[i].sy, opacity_[lane] = in.opacities[i];
             const R* slot = args.sums + int64_t(args.spans[i].begin) * kSlot;
-            double total[kSums] = {};
+            double total[kSlot] = {};
             for (uint32_t pair = 0; pair < args.spans[i].count; pair++, slot += kSlot)
-                for (int q = 0; q < kSums; q++) total[q] += double(slot[q]);
-            for (int q = 0; q < kSums; q++) sums[q][lane] = total[q];
+                if (args.written[args.spans[i].begin + pair])
+                    for (int q = 0; q < kSlot; q++) total[q] += double(slot[q]);
+            std::memcpy(sums[lane], total, sizeof total);
         }
+        const D none[4] = {d8(0), d8(0), d8(0), d8(0)};
+        const auto put = [&](const D* means, const D* quats, const D* log_scales, const D* opacity, const D* colors, const D* offset) {
+            store_columns<3>(args.v_means, group, end, means), store_columns<4>(args.v_quats, group, end, quats);
+            store_columns<3>(args.v_log_scales, group, end, log_scales), store_columns<1>(args.v_opacities, group, end, opacity);
+            store_columns<3>(args.v_colors, group, end, colors);
+            if (args.v_offset) store_columns<2>(args.v_offset, group, end, offset);
+        };
         if (!drawn) {
-            for (int64_t i = group; i < group + kGroup && i < end; i++) {
-                for (int q = 0; q < 3; q++) args.v_means[3 * i + q] = args.v_log_scales[3 * i + q] = args.v_colors[3 * i + q] = R(0);
-                for (int q = 0; q < 4; q++) args.v_quats[4 * i + q] = R(0);
-                args.v_opacities[i] = R(0);
-                if (args.v_offset) args.v_offset[2 * i] = args.v_offset[2 * i + 1] = R(0);
-            }
+            put(none, none, none, none, none, none);
             continue;
         }
         const Projected p = project_group(k, args.settings, in, group);
-        const D sr = load<kGroup>(sr_), sy = load<kGroup>(sy_), ln2 = d8(kLn2);
-        const D e = load<kGroup>(sums[kE]), e_r = load<kGroup>(sums[kR]) / (sr * p.v);
-        const D g_x = -e_r;
-        const D g_y = p.slope * e_r - load<kGroup>(sums[kS]) / (sy * p.c);
-        const D g_slope = -(load<kGroup>(sums[kRS]) / (sr * sy * p.v));
-        const D g_v = -(ln2 * load<kGroup>(sums[kRR]) / p.v);
-        const D g_c = -(ln2 * load<kGroup>(sums[kSS]) / p.c);
-        const D g_opacity = -(e / load<kGroup>(opacity));
+        D total[kSlot];
+        columns_of<kSlot>(sums[0], 0, kGroup, total);
+        const D ln2 = d8(kLn2), inverse_v = d8(1) / p.v, inverse_sr = d8(1) / load_as<kGroup>(sr_), inverse_sy = d8(1) / load_as<kGroup>(sy_);
+        const D across = inverse_sr * inverse_v, g_x = total[kR] * across;
+        const D g_y = total[kS] * inverse_sy * p.inverse_c - p.slope * g_x;
+        const D g_slope = total[kRS] * inverse_sy * across;
+        const D g_v = ln2 * total[kRR] * inverse_v;
+        const D g_c = ln2 * total[kSS] * p.inverse_c;
+        const D g_opacity = total[kE] / load_as<kGroup>(opacity_);
 
-        const D bent = g_slope / p.c, two = d8(2);
+        const D bent = g_slope * p.inverse_c, two = d8(2);
         D gn1[3], gn2[3], g_rho[3], g_affine[6];
         for (int j = 0; j < 3; j++) {
             const D t = p.m1[j] - p.slope * p.m2[j];
@@ -229,7 +362,7 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         const D free_x = select(p.held_x <= p.ratio_x, select(p.ratio_x <= p.held_x, g_held_x, zero), zero);
         const D free_y = select(p.held_y <= p.ratio_y, select(p.ratio_y <= p.held_y, g_held_y, zero), zero);
         const D to_x = free_x + fx * g_x, to_y = free_y + fy * g_y;
-        const D camera[3] = {to_x * iz, to_y * iz, g_z - iz * (to_x * p.ratio_x + to_y * p.ratio_y) + load<kGroup>(sums[kDepth])};
+        const D camera[3] = {to_x * iz, to_y * iz, g_z - iz * (to_x * p.ratio_x + to_y * p.ratio_y) + total[kDepth]};
 
         const D w = p.quat[0], a = p.quat[1], b = p.quat[2], d = p.quat[3];
         D q[4];
@@ -239,23 +372,17 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         q[3] = two * (a * (V[2] + V[6]) + b * (V[5] + V[7]) + w * (V[3] - V[1]) - two * d * (V[0] + V[4]));
         const D radial = q[0] * w + q[1] * a + q[2] * b + q[3] * d;
 
-        double out[16][kGroup];
-        for (int i = 0; i < 3; i++) store(out[i], fma(d8(w2c[i]), camera[0], fma(d8(w2c[3 + i]), camera[1], d8(w2c[6 + i]) * camera[2])));
-        for (int i = 0; i < 4; i++) store(out[3 + i], (q[i] - radial * p.quat[i]) * p.inverse_norm);
-        for (int i = 0; i < 3; i++) store(out[7 + i], g_rho[i]);
-        store(out[10], g_opacity), store(out[11], g_x), store(out[12], g_y);
-        for (int lane = 0; lane < kGroup && group + lane < end; lane++) {
-            const int64_t i = group + lane;
-            const bool on = args.status[i] == kDrawn;  // what was not drawn has no gradient, whatever its lanes hold
-            for (int q_ = 0; q_ < 3; q_++) {
-                args.v_means[3 * i + q_] = on ? R(out[q_][lane]) : R(0);
-                args.v_log_scales[3 * i + q_] = on ? R(out[7 + q_][lane]) : R(0);
-                args.v_colors[3 * i + q_] = on ? R(sums[kRed + q_][lane]) : R(0);
-            }
-            for (int q_ = 0; q_ < 4; q_++) args.v_quats[4 * i + q_] = on ? R(out[3 + q_][lane]) : R(0);
-            args.v_opacities[i] = on ? R(out[10][lane]) : R(0);
-            if (args.v_offset) args.v_offset[2 * i] = on ? R(out[11][lane]) : R(0), args.v_offset[2 * i + 1] = on ? R(out[12][lane]) : R(0);
+        // what was not drawn has no gradient, whatever its lanes hold
+        const auto on = zero < load<kGroup>(on_);
+        const auto kept = [&](D x) { return select(on, x, zero); };
+        D means[3], quats[4], log_scales[3], colors[3];
+        for (int i = 0; i < 3; i++) {
+            means[i] = kept(fma(d8(w2c[i]), camera[0], fma(d8(w2c[3 + i]), camera[1], d8(w2c[6 + i]) * camera[2])));
+            log_scales[i] = kept(g_rho[i]), colors[i] = kept(total[kRed + i]);
         }
+        for (int i = 0; i < 4; i++) quats[i] = kept((q[i] - radial * p.quat[i]) * p.inverse_norm);
+        const D opacity = kept(g_opacity), offset[2] = {kept(g_x), kept(g_y)};
+        put(means, quats, log_scales, &opacity, colors, offset);
     }
 }
 

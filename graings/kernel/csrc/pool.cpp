@@ -8,6 +8,10 @@
 #include <list>
 #include <mutex>
 #include <thread>
+#ifdef __linux__
+#include <pthread.h>
+#include <sched.h>
+#endif
 
 namespace graings {
 namespace {
@@ -36,6 +40,26 @@ bool look_about(Done done) {
     return done();
 }
 
+// A thread that sleeps, and the CPU it last ran on.
+struct Worker {
+    std::thread thread;
+    std::atomic<int> cpu{-1};
+
+#ifdef __linux__
+    void stay() { cpu.store(sched_getcpu(), std::memory_order_relaxed); }
+    // Linux likes to wake a thread where it slept, even if that CPU is busy with the one who wakes it and others are
+    // idle; the two then take turns for milliseconds.
+    void make_way(int busy, const cpu_set_t& usable) {
+        if (cpu.load(std::memory_order_relaxed) != busy) return;
+        cpu_set_t others = usable;
+        CPU_CLR(busy, &others);
+        if (CPU_COUNT(&others) > 0) pthread_setaffinity_np(thread.native_handle(), sizeof others, &others);
+    }
+#else
+    void stay() {}
+#endif
+};
+
 struct Job {
     const std::function<void(int, int64_t)>* body;
     int64_t pieces;
@@ -56,10 +80,15 @@ public:
         Job job{&body, pieces, threads - 1};
         {
             std::lock_guard lock(mutex_);
-            while (size_ < threads - 1) {
-                std::thread([this] { serve(); }).detach();  // ends with the process
-                size_++;
+            while (int(workers_.size()) < threads - 1) {
+                Worker& worker = workers_.emplace_back();
+                worker.thread = std::thread([this, &worker] { serve(worker); });  // ends with the process
             }
+#ifdef __linux__
+            cpu_set_t usable;
+            if (sched_getaffinity(0, sizeof usable, &usable) == 0)
+                for (Worker& worker : workers_) worker.make_way(sched_getcpu(), usable);
+#endif
             jobs_.push_back(&job);
             posted_.fetch_add(1, std::memory_order_release);
         }
@@ -80,7 +109,7 @@ public:
     }
 
 private:
-    [[noreturn]] void serve() {
+    [[noreturn]] void serve(Worker& self) {
         for (int64_t seen = 0;;) {
             look_about([&] { return posted_.load(std::memory_order_acquire) != seen; });
             std::unique_lock lock(mutex_);
@@ -101,6 +130,7 @@ private:
                 error = std::current_exception();
                 job->next.store(job->pieces, std::memory_order_relaxed);
             }
+            self.stay();
             lock.lock();
             if (error && !job->error) job->error = error;
             if (--job->inside == 0) left_.notify_all();
@@ -110,8 +140,8 @@ private:
     std::mutex mutex_;
     std::condition_variable wake_, left_;
     std::list<Job*> jobs_;
+    std::list<Worker> workers_;  // never shrinks
     std::atomic<int64_t> posted_{0};
-    int size_ = 0;
 };
 
 Pool& pool() {

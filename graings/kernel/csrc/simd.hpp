@@ -135,7 +135,7 @@ GRAINGS_BINARY(min, least(a.v, b.v))
 GRAINGS_BINARY(max, most(a.v, b.v))
 #undef GRAINGS_BINARY
 GRAINGS_VEC Vec<T, N> splat(T x) {
-    if constexpr (kOne<T, N>) { Native<T> zero = {}; return {zero + x}; }
+    if constexpr (kOne<T, N>) { return {x - Native<T>{}}; }
     else { auto h = splat<T, N / 2>(x); return {h, h}; }
 }
 GRAINGS_VEC Vec<T, N> operator-(Vec<T, N> a) { return splat<T, N>(T(0)) - a; }
@@ -196,6 +196,29 @@ template <class R, int N> GRAINGS_INLINE void store_as(R* p, Vec<double, N> a) {
         std::memcpy(p, &rounded, sizeof rounded);
     } else { store_as<R>(p, a.lo); store_as<R>(p + N / 2, a.hi); }
 }
+// N numbers of R, widened.
+template <int N, class R> GRAINGS_INLINE Vec<double, N> load_as(const R* p) {
+    if constexpr (sizeof(R) == sizeof(double)) return load<N>(p);
+    else if constexpr (kOne<double, N>) {
+        typedef float Half __attribute__((vector_size(kBytes / 2)));
+        Half narrow;
+        std::memcpy(&narrow, p, sizeof narrow);
+        return {__builtin_convertvector(narrow, Native<double>)};
+    } else return {load_as<N / 2>(p), load_as<N / 2>(p + N / 2)};
+}
+// Rounded to R.
+template <class R> GRAINGS_INLINE Vec<R, 16> rounded(Vec<double, 16> a) {
+    if constexpr (sizeof(R) == sizeof(double)) return a;
+#if defined(__AVX512DQ__)
+    else return {(Native<R>)_mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps((__m512d)a.lo.v)), _mm512_cvtpd_ps((__m512d)a.hi.v), 1)};
+#else
+    else {
+        R numbers[16];
+        store_as<R>(numbers, a);
+        return load<16>(numbers);
+    }
+#endif
+}
 GRAINGS_VEC T sum(Vec<T, N> a) {
     if constexpr (kOne<T, N>) return total(a.v);
     else return sum(a.lo + a.hi);
@@ -245,6 +268,19 @@ GRAINGS_VEC Vec<T, N> exp2_minus(Vec<T, N> x) {
     auto shifted = splat<T, N>(magic) - x;
     auto f = (splat<T, N>(magic) - shifted) - x;
     return scale_by_power(power_of_two_part(f), shifted);
+}
+// The whole number below, for |x| < 2^51
+GRAINGS_VEC Vec<T, N> floor(Vec<T, N> x) {
+    static_assert(sizeof(T) == 8);
+    if constexpr (kOne<T, N>) {
+#if defined(__AVX512F__)
+        return {(Native<T>)_mm512_roundscale_pd((__m512d)x.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)};
+#else
+        constexpr T magic = 6755399441055744;
+        const Native<T> nearest = (x.v + magic) - magic;
+        return {nearest - choose(less(x.v, nearest), Native<T>{} + T(1), Native<T>{})};
+#endif
+    } else return {floor(x.lo), floor(x.hi)};
 }
 // e^x, with x limited to [-708, 709]
 template <int N> GRAINGS_INLINE Vec<double, N> exp(Vec<double, N> x) {

@@ -1,5 +1,6 @@
-// The gradient of one tile's pixels, back to front: forward once more to keep alpha and weight of every entry and
-// block, then the recurrence of what lies behind (numerically stable: nothing is subtracted or divided).
+// The gradient of one tile's pixels, back to front in one walk. Alpha is evaluated again, bit by bit as in the forward
+// pass, so that the light before an entry is the light behind it divided by 1 - alpha; what a pixel sees behind an entry
+// follows from a convex recurrence.
 #pragma once
 #include "tiles.hpp"
 
@@ -29,113 +30,101 @@ GRAINGS_INLINE void sums_of_twelve(const P<R>* v, R* out) {
     for (int q = 0; q < kSlot; q++) out[q] = sum(v[q]);
 }
 
-template <class R, bool Compat, bool Extra>
-GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const TileScratch<R>& scratch) {
-    const TileArgs<R>& args = all.tiles;
-    const TileBox box = tile_box(args.camera, tile);
-    const Rule<R> limits = rule<R>(args.settings);
-    const P<R> columns = lanes_of<R>(kColumns), rows = lanes_of<R>(kRows), zero = p16(R(0));
-    const int64_t begin = args.begin[tile], end = args.begin[tile + 1];
-    double* v_ground = all.v_background + 3 * tile;
-    v_ground[0] = v_ground[1] = v_ground[2] = 0;
-
-    // upstream: colour, then alpha, then depth
-    alignas(64) R up[5][kBlocks][kLanes];
-    typename Bits<R>::type noise = 0;  // a NaN is not silence
-    const auto hear = [&](const R* row, int n) {
-        for (int i = 0; i < n; i++) {
-            typename Bits<R>::type word;
-            std::memcpy(&word, row + i, sizeof word);
-            noise |= word << 1;  // -0 is 0
-        }
-    };
+// Rows of pixels become blocks; outside the image they are 0.
+template <int Channels, class R>
+GRAINGS_INLINE void to_blocks(const R* image, const TileBox& box, int64_t width, R (*blocks)[kBlocks][kLanes]) {
     for (int y = 0; y < kTile; y++) {
-        R color[3 * kTile] = {}, alpha[kTile] = {}, depth[kTile] = {};
+        R edge[Channels * kTile] = {};
+        const R* row = edge;
         if (y < box.height) {
-            const int64_t pixel = (box.top + y) * args.camera.width + box.left;
-            std::memcpy(color, all.v_color + 3 * pixel, sizeof(R) * size_t(3 * box.width));
-            hear(color, 3 * kTile);
-            if (Extra && all.v_alpha) std::memcpy(alpha, all.v_alpha + pixel, sizeof(R) * size_t(box.width)), hear(alpha, kTile);
-            if (Extra && all.v_depth) std::memcpy(depth, all.v_depth + pixel, sizeof(R) * size_t(box.width)), hear(depth, kTile);
+            row = image + Channels * ((box.top + y) * width + box.left);
+            if (box.width < kTile) std::memcpy(edge, row, sizeof(R) * size_t(Channels * box.width)), row = edge;
         }
         for (int x = 0; x < kTile; x++) {
             const int b = (y >> 2) * 4 + (x >> 2), l = (y & 3) * 4 + (x & 3);
-            for (int c = 0; c < 3; c++) up[c][b][l] = color[3 * x + c];
-            if constexpr (Extra) up[3][b][l] = alpha[x], up[4][b][l] = depth[x];
+            for (int c = 0; c < Channels; c++) blocks[c][b][l] = row[Channels * x + c];
         }
     }
-    const bool silent = noise == 0;
-    if (silent) {
-        for (int64_t k = begin; k < end; k++) std::memset(all.sums + int64_t(all.slots[k]) * kSlot, 0, sizeof(R) * kSlot);
-        return;
-    }
+}
 
-    // forward again, to keep alpha and weight of every (entry, block)
-    alignas(64) R open[kBlocks][kLanes], light[kBlocks][kLanes], behind[kBlocks][kLanes];
-    open_lanes(box, open);
-    std::memcpy(light, open, sizeof light);
-    const int n = args.processed[tile];
-    int32_t item = 0;
-    for (int first = 0; first < n; first += kChunk) {
-        const int count = n - first < kChunk ? n - first : kChunk;
-        uint16_t masks[kChunk] = {};
-        uint32_t lists[kBlocks];
-        for (int i = 0; i < count; i++) {
-            const int j = first + i;
-            if (j + 8 < n) __builtin_prefetch(&args.records[args.ids[begin + j + 8]]);
-            masks[i] = args.masks[begin + j];
-            scratch.first_item[j] = item;
-            item += __builtin_popcount(masks[i]);
-            if (masks[i]) prepare(scratch.entries[j], args.records[args.ids[begin + j]], double(box.left), double(box.top));
-        }
-        by_block(masks, lists);
-        for (int b = 0; b < kBlocks; b++) {
-            if (lists[b] == 0) continue;
-            P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]);
-            for (uint32_t list = lists[b]; list; list &= list - 1) {
-                const int i = __builtin_ctz(list);
-                const int64_t at = (scratch.first_item[first + i] + __builtin_popcount(masks[i] & ((1u << b) - 1))) * kLanes;
-                const TileEntry<R>& entry = scratch.entries[first + i];
-                const P<R> raw = uncapped_alpha(entry, distance(entry, b, columns, rows));
-                const Step<R> step = blend<R, Compat>(raw, limits, t, going);
-                store(scratch.alphas + at, step.alpha);
-                store(scratch.weights + at, select(p16(limits.alpha_max) < raw, zero - step.weight, step.weight));
-            }
-            store(light[b], t), store(open[b], going);
-        }
+// Whether any of the numbers is not 0; a NaN is not.
+template <class R>
+GRAINGS_INLINE bool any_set(const R* numbers) {
+    typename Bits<R>::type words[kLanes], all = 0;
+    std::memcpy(words, numbers, sizeof words);
+    for (int l = 0; l < kLanes; l++) all |= words[l] << 1;  // -0 is 0
+    return all != 0;
+}
+
+template <class R, bool Extra>
+GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
+    const TileArgs<R>& args = all.tiles;
+    const int64_t begin = args.begin[tile], end = args.begin[tile + 1];
+    double* v_ground = all.v_background ? all.v_background + 3 * tile : nullptr;
+    if (v_ground) v_ground[0] = v_ground[1] = v_ground[2] = 0;
+    if (begin == end && !v_ground) return;
+    const TileBox box = tile_box(args.camera, tile);
+    const Rule<R> limits = rule<R>(args.settings);
+    const P<R> rows = load<kLanes>(kRows<R>), zero = p16(R(0));
+
+    // upstream: colour, then alpha, then depth
+    constexpr int kChannels = Extra ? 5 : 3;
+    alignas(64) R up[5][kBlocks][kLanes];
+    to_blocks<3>(all.v_color, box, args.camera.width, up);
+    if constexpr (Extra) {
+        std::memset(up[3], 0, 2 * sizeof up[3]);
+        if (all.v_alpha) to_blocks<1>(all.v_alpha, box, args.camera.width, up + 3);
+        if (all.v_depth) to_blocks<1>(all.v_depth, box, args.camera.width, up + 4);
     }
+    uint32_t heard = 0;  // blocks whose pixels have a say
+    for (int b = 0; b < kBlocks; b++)
+        for (int c = 0; c < kChannels; c++) heard |= uint32_t(any_set(up[c][b])) << b;
+
+    const int n = heard ? args.processed[tile] : 0;
+    for (int64_t k = begin + n; k < end; k++) all.written[all.slots[k]] = 0;
+    if (!heard) return;
 
     // what a pixel sees behind the current entry, weighed by its upstream: starts at the background
+    alignas(64) R light[kBlocks][kLanes], behind[kBlocks][kLanes];
+    if (begin == end) open_lanes(box, light);  // drawn without a walk
+    else std::memcpy(light, args.light + tile * kBlocks * kLanes, sizeof light);
+    const R(*last)[kLanes] = reinterpret_cast<const R(*)[kLanes]>(args.last + tile * kBlocks * kLanes);
     for (int b = 0; b < kBlocks; b++) {
-        const P<R> t = load<kLanes>(light[b]);
-        P<R> sum_ = zero;
+        P<R> ground = zero;
         for (int c = 0; c < 3; c++) {
             const P<R> g = load<kLanes>(up[c][b]);
-            sum_ = fma(g, p16(args.background[c]), sum_);
-            v_ground[c] += double(sum(g * t));
+            ground = fma(g, p16(args.background[c]), ground);
+            if (v_ground) v_ground[c] += double(sum(g * load<kLanes>(light[b])));
         }
-        store(behind[b], sum_);
+        store(behind[b], ground);
     }
 
-    for (int64_t k = begin + n; k < end; k++) std::memset(all.sums + int64_t(all.slots[k]) * kSlot, 0, sizeof(R) * kSlot);
-    for (int j = n - 1; j >= 0; j--) {
-        R* slot = all.sums + int64_t(all.slots[begin + j]) * kSlot;
-        uint32_t mask = args.masks[begin + j];
-        if (!mask) {
-            std::memset(slot, 0, sizeof(R) * kSlot);
-            continue;
+    constexpr int kAhead = 32;  // entries prepared at a time; meanwhile the memory of the next ones comes near
+    TileEntry<R> chunk[kAhead];
+    const auto slot_of = [&](int j) { return size_t(all.slots[begin + j]); };
+    for (int first = (n - 1) / kAhead * kAhead; n > 0 && first >= 0; first -= kAhead) {
+    const int count = n - first < kAhead ? n - first : kAhead;
+    for (int i = 0; i < count; i++) prepare(chunk[i], args.records[args.ids[begin + first + i]], double(box.left), double(box.top));
+    for (int i = count - 1; i >= 0; i--) {
+        const int j = first + i;
+        if (j >= kAhead) {
+            __builtin_prefetch(&args.records[args.ids[begin + j - kAhead]]);
+            __builtin_prefetch(all.sums + slot_of(j - kAhead) * kSlot, 1);
         }
-        const TileEntry<R>& entry = scratch.entries[j];
-        const R* alphas = scratch.alphas + int64_t(scratch.first_item[j]) * kLanes;
-        const R* weights = scratch.weights + int64_t(scratch.first_item[j]) * kLanes;
+        uint32_t mask = args.masks[begin + j] & heard;
+        all.written[slot_of(j)] = mask != 0;
+        if (!mask) continue;
+        const TileEntry<R>& entry = chunk[i];
         P<R> e = zero, er = zero, es = zero, err = zero, ers = zero, ess = zero;
         P<R> red = zero, green = zero, blue = zero, depth = zero;
-        for (; mask; mask &= mask - 1, alphas += kLanes, weights += kLanes) {
+        for (; mask; mask &= mask - 1) {
             const int b = __builtin_ctz(mask);
-            const Distance<R> d = distance(entry, b, columns, rows);
-            const P<R> alpha = load<kLanes>(alphas), signed_weight = load<kLanes>(weights);
-            const P<R> passing = max(signed_weight, zero);            // capped alpha passes no gradient
-            const P<R> weight = abs(signed_weight);
+            const Distance<R> d = distance(entry, b, rows);
+            const P<R> raw = uncapped_alpha(entry, d);
+            const auto counts = (p16(limits.alpha_min) <= raw) & (p16(R(j)) <= load<kLanes>(last[b]));
+            const P<R> alpha = select(counts, min(raw, p16(limits.alpha_max)), zero);
+            const P<R> before = load<kLanes>(light[b]) / (p16(R(1)) - alpha), weight = alpha * before;
+            store(light[b], before);
             const P<R> g0 = load<kLanes>(up[0][b]), g1 = load<kLanes>(up[1][b]), g2 = load<kLanes>(up[2][b]);
             P<R> own = fma(g0, p16(entry.red), fma(g1, p16(entry.green), g2 * p16(entry.blue)));
             if constexpr (Extra) {
@@ -143,25 +132,24 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile, const
                 own = fma(g4, p16(entry.depth), own + load<kLanes>(up[3][b]));
                 depth = fma(weight, g4, depth);
             }
-            const P<R> back = load<kLanes>(behind[b]);
-            const P<R> ge = passing * (back - own);
-            store(behind[b], fma(alpha, own, (p16(R(1)) - alpha) * back));
+            const P<R> back = load<kLanes>(behind[b]), gain = own - back;
+            store(behind[b], fma(alpha, gain, back));
+            const P<R> ge = select(raw <= p16(limits.alpha_max), weight * gain, zero);  // capped alpha passes none
             const P<R> ge_r = ge * d.r, ge_s = ge * d.s;
             e = e + ge, er = er + ge_r, es = es + ge_s;
             err = fma(ge_r, d.r, err), ers = fma(ge_r, d.s, ers), ess = fma(ge_s, d.s, ess);
             red = fma(weight, g0, red), green = fma(weight, g1, green), blue = fma(weight, g2, blue);
         }
         const P<R> totals[kSlot] = {e, er, es, err, ers, ess, red, green, blue, depth, zero, zero};
-        sums_of_twelve(totals, slot);
+        sums_of_twelve(totals, all.sums + slot_of(j) * kSlot);
+    }
     }
 }
 
 template <class R>
-static void tile_gradient(const TileGradientArgs<R>& args, int64_t tile, const TileScratch<R>& scratch) {
-    const bool extra = args.v_alpha || args.v_depth, compat = args.tiles.settings.compat;
-    if (compat) gradient<R, true, true>(args, tile, scratch);
-    else if (extra) gradient<R, false, true>(args, tile, scratch);
-    else gradient<R, false, false>(args, tile, scratch);
+static void tile_gradient(const TileGradientArgs<R>& args, int64_t tile) {
+    if (args.v_alpha || args.v_depth) gradient<R, true>(args, tile);
+    else gradient<R, false>(args, tile);
 }
 
 }  // namespace graings::GRAINGS_ISA

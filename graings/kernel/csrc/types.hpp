@@ -28,24 +28,29 @@ enum Status : uint8_t { kDrawn, kNonFinite, kZeroQuat, kBehind, kFaint, kOutside
 
 // One projected Gaussian: a cache line in single precision. With dx, dy = pixel - mean,
 // alpha = opacity * 2^-((sr (dx - slope dy))^2 + (sy dy)^2); nothing is drawn where the exponent exceeds `level`.
+// `flat` = 1 / sy and `fall` = 1 / ((sr slope)^2 + sy^2) only tell where that exponent is least.
 template <class R>
 struct alignas(64) Record {
-    double x, y, slope, sr, sy;
-    R opacity, red, green, blue, depth, level;
+    double x, y, slope;
+    R sr, sy, opacity, red, green, blue, depth, level, flat, fall;
 };
 static_assert(sizeof(Record<float>) == 64);
 
-// The (tile, Gaussian) pairs of one Gaussian, and the rows of tiles they lie in.
+// The (tile, Gaussian) pairs of one Gaussian: where its sums begin and how many tiles it touches, of those in columns
+// left..right and rows top..bottom.
 struct Span {
-    uint32_t begin, count, first_row, last_row;
+    uint32_t begin, count, left, right, top, bottom;
+    bool is_box() const { return count == (right - left + 1) * (bottom - top + 1); }
 };
 
-// A record seen from one tile: its scaled distances at the centre of the first block, in float64 as long as large
-// numbers may cancel, and how they change from block to block and from pixel to pixel.
+// A record seen from one tile. With a pixel's place in its block, r = base_r[block] + lanes[pixel] and
+// s = base_s[block] + rise * row are the scaled distances; the bases are rounded from float64, where large numbers may
+// cancel.
 template <class R>
-struct TileEntry {
-    double r, s, sr, tilt, sy;
-    R wide, lean, rise, opacity, red, green, blue, depth;  // wide, lean, rise: sr, tilt, sy rounded
+struct alignas(64) TileEntry {
+    R lanes[kLanes], base_r[kBlocks], base_s[kBlocks];
+    R rise, opacity, red, green, blue, depth;
+    R wide, lean, flat, fall, level;  // for the blocks it reaches
 };
 
 template <class R>
@@ -64,7 +69,7 @@ struct ProjectArgs {
     Record<R>* records;
     uint8_t* status;
     double* depths;
-    double* extents;  // [N, 2] px: half the width and height of the footprint
+    Span* spans;  // all but `begin`; the count is that of all tiles in the rectangle
     R *means2d, *radii;
 };
 
@@ -80,6 +85,8 @@ struct TileArgs {
     uint16_t* masks;      // blocks of the tile that the entry may touch and that were still open
     int32_t* processed;   // entries per tile that were looked at before every pixel had stopped
     int32_t* items;       // (entry, block) pairs per tile
+    R *light, *last;      // [tile, block, lane] for the gradient, or null: what passes all entries, and the number of
+                          // the last entry of the tile that counted
     R *color, *alpha, *depth;
 };
 
@@ -89,15 +96,8 @@ struct TileGradientArgs {
     const uint32_t* slots;             // where the sums of an entry go: contiguous per Gaussian, in tile order
     const R *v_color, *v_alpha, *v_depth;  // the last two may be null
     R* sums;                           // [slot, kSlot]
-    double* v_background;              // [tile, 3]
-};
-
-template <class R>
-struct TileScratch {
-    TileEntry<R>* entries;
-    int32_t* first_item;
-    R* alphas;   // [item, lane]
-    R* weights;  // [item, lane]; negative where alpha was capped
+    uint8_t* written;                  // [slot]: whether there are sums; there are none where all are 0
+    double* v_background;              // [tile, 3] or null
 };
 
 template <class R>
@@ -109,6 +109,7 @@ struct GeometryGradientArgs {
     const Record<R>* records;
     const Span* spans;          // per Gaussian
     const R* sums;
+    const uint8_t* written;
     R *v_means, *v_quats, *v_log_scales, *v_opacities, *v_colors, *v_offset;  // v_offset may be null
 };
 
@@ -146,7 +147,7 @@ template <class R>
 struct Kernels {
     void (*project)(const ProjectArgs<R>&, int64_t begin, int64_t end);
     void (*draw_tile)(const TileArgs<R>&, int64_t tile, TileEntry<R>* chunk);
-    void (*tile_gradient)(const TileGradientArgs<R>&, int64_t tile, const TileScratch<R>&);
+    void (*tile_gradient)(const TileGradientArgs<R>&, int64_t tile);
     void (*geometry_gradient)(const GeometryGradientArgs<R>&, int64_t begin, int64_t end);
     void (*ssim_values)(const SsimArgs<R>&, int64_t band, int64_t begin, int64_t end, R* scratch);
     void (*ssim_gradient)(const SsimArgs<R>&, int64_t begin, int64_t end, R* scratch);
@@ -154,6 +155,6 @@ struct Kernels {
     void (*network_gradient)(const NetworkArgs<R>&, int64_t begin, int64_t end, R* sums, R* scratch);
 };
 
-constexpr int kChunk = 32;  // entries of a tile prepared at a time in the forward pass
+constexpr int kChunk = 64;  // entries of a tile prepared at a time in the forward pass
 
 }  // namespace graings
