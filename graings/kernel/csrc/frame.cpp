@@ -33,12 +33,21 @@ constexpr int64_t kPiece = 512;  // Gaussians handed to a thread at a time
 
 int64_t pieces_of(int64_t count, int64_t piece) { return (count + piece - 1) / piece; }
 
+// Neighbours share Gaussians: a thread takes a few tiles at a time.
+template <class Visit>
+void each_tile(int threads, int64_t tiles, Visit visit) {
+    constexpr int64_t kTogether = 4;
+    parallel_for(threads, pieces_of(tiles, kTogether), [&](int worker, int64_t piece) {
+        for (int64_t tile = piece * kTogether; tile < std::min(tiles, (piece + 1) * kTogether); tile++) visit(worker, tile);
+    });
+}
+
 uint64_t bits_of_depth(double depth) { return std::bit_cast<uint64_t>(depth); }  // positive: ordered like the numbers
 
 // Tiles that a record may touch, row by row: visit(row of tiles, first tile column, last one).
 template <class R, class Visit>
 void each_tile_row(const Record<R>& record, const Span& span, int64_t width, Visit visit) {
-    const double sr = double(record.sr), sy = double(record.sy), level = double(record.level), steep = record.slope * sr;
+    const double sr = double(record.look.sr), sy = double(record.look.sy), level = double(record.look.level), steep = record.slope * sr;
     const double highest = std::sqrt(level) / sy, turn = highest * steep / std::sqrt(steep * steep + sy * sy);
     for (uint32_t row = span.top; row <= span.bottom; row++) {
         const double low = std::max(double(row * kTile) + 0.5 - record.y, -highest);
@@ -82,7 +91,7 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
     TileArgs<R> tiles = tile_args(in.background);
     tiles.color = out.color, tiles.alpha = out.alpha, tiles.depth = out.depth;
     Buffer<TileEntry<R>> chunks(size_t(threads) * kChunk);
-    parallel_for(threads, tiles_, [&](int worker, int64_t tile) { run.draw_tile(tiles, tile, chunks.get() + worker * kChunk); });
+    each_tile(threads, tiles_, [&](int worker, int64_t tile) { run.draw_tile(tiles, tile, chunks.get() + worker * kChunk); });
     seconds_[kBlend] = watch.lap();
 }
 
@@ -248,11 +257,11 @@ void Frame<R>::gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha,
     if (in.count != count_) throw std::invalid_argument("the gradient needs the Gaussians of the forward pass");
     const Kernels<R>& run = kernels<R>();
     Stopwatch watch;
-    Buffer<R> sums(size_t(pairs_) * kSlot);
+    Buffer<R> sums(size_t(pairs_) * kSums);
     Buffer<uint8_t> written{size_t(pairs_)};
     Buffer<double> v_background(out.background ? size_t(tiles_) * 3 : 0);
     const TileGradientArgs<R> tiles{tile_args(in.background), slots_.get(), v_color, v_alpha, v_depth, sums.get(), written.get(), out.background ? v_background.get() : nullptr};
-    parallel_for(threads, tiles_, [&](int, int64_t tile) { run.tile_gradient(tiles, tile); });
+    each_tile(threads, tiles_, [&](int, int64_t tile) { run.tile_gradient(tiles, tile); });
     if (out.background) {
         double ground[3] = {};
         for (int64_t tile = 0; tile < tiles_; tile++)

@@ -215,7 +215,7 @@ GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, 
     for (int c = 0; c < 3; c++) store(x[c], whole[c]);
     for (int c = 0; c < 10; c++) store_as<R>(y[c], pairs[c / 2][c % 2]);
     for (int i = 0; i < kGroup && begin + i < end; i++)
-        records[begin + i] = {x[0][i], x[1][i], x[2][i], y[0][i], y[1][i], y[2][i], y[3][i], y[4][i], y[5][i], y[6][i], y[7][i], y[8][i], y[9][i]};
+        records[begin + i] = {x[0][i], x[1][i], x[2][i], {y[0][i], y[1][i], y[2][i], y[3][i], y[4][i], y[5][i], y[6][i], y[7][i], y[8][i], y[9][i]}};
 }
 
 template <class R>
@@ -300,20 +300,23 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
     const Camera& k = args.camera;
     const Inputs<R>& in = args.in;
     for (int64_t group = begin; group < end; group += kGroup) {
-        double sums[kGroup][kSlot] = {}, on_[kGroup] = {};
+        double sums[kGroup][kSums], on_[kGroup] = {};
         R sr_[kGroup], sy_[kGroup], opacity_[kGroup];
         bool drawn = false;
         for (int lane = 0; lane < kGroup; lane++) {
             const int64_t i = group + lane;
             sr_[lane] = sy_[lane] = opacity_[lane] = 1;
-            if (i >= end || args.status[i] != kDrawn) continue;
+            if (i >= end || args.status[i] != kDrawn) {
+                std::memset(sums[lane], 0, sizeof sums[lane]);
+                continue;
+            }
             drawn = true, on_[lane] = 1;
-            sr_[lane] = args.records[i].sr, sy_[lane] = args.records[i].sy, opacity_[lane] = in.opacities[i];
-            const R* slot = args.sums + int64_t(args.spans[i].begin) * kSlot;
-            double total[kSlot] = {};
-            for (uint32_t pair = 0; pair < args.spans[i].count; pair++, slot += kSlot)
+            sr_[lane] = args.records[i].look.sr, sy_[lane] = args.records[i].look.sy, opacity_[lane] = in.opacities[i];
+            const R* slot = args.sums + int64_t(args.spans[i].begin) * kSums;
+            double total[kSums] = {};
+            for (uint32_t pair = 0; pair < args.spans[i].count; pair++, slot += kSums)
                 if (args.written[args.spans[i].begin + pair])
-                    for (int q = 0; q < kSlot; q++) total[q] += double(slot[q]);
+                    for (int q = 0; q < kSums; q++) total[q] += double(slot[q]);
             std::memcpy(sums[lane], total, sizeof total);
         }
         const D none[4] = {d8(0), d8(0), d8(0), d8(0)};
@@ -328,8 +331,8 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
             continue;
         }
         const Projected p = project_group(k, args.settings, in, group);
-        D total[kSlot];
-        columns_of<kSlot>(sums[0], 0, kGroup, total);
+        D total[kSums];
+        columns_of<kSums>(sums[0], 0, kGroup, total);
         const D ln2 = d8(kLn2), inverse_v = d8(1) / p.v, inverse_sr = d8(1) / load_as<kGroup>(sr_), inverse_sy = d8(1) / load_as<kGroup>(sy_);
         const D across = inverse_sr * inverse_v, g_x = total[kR] * across;
         const D g_y = total[kS] * inverse_sy * p.inverse_c - p.slope * g_x;

@@ -6,9 +6,9 @@
 
 namespace graings::GRAINGS_ISA {
 
-// out[q] = sum of the 16 numbers of v[q], for twelve of them at once.
+// out[q] = sum of the 16 numbers of v[q], for all sums of an entry at once.
 template <class R>
-GRAINGS_INLINE void sums_of_twelve(const P<R>* v, R* out) {
+GRAINGS_INLINE void add_lanes(const P<R> (&v)[kSums], R* out) {
 #if defined(__AVX512F__)
     if constexpr (sizeof(R) == 4) {
         // Halve three times, two vectors into one each time; each keeps its own part of the lanes.
@@ -16,18 +16,18 @@ GRAINGS_INLINE void sums_of_twelve(const P<R>* v, R* out) {
         const auto pairs = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_shuffle_ps(a, b, 0x88), _mm512_shuffle_ps(a, b, 0xDD)); };
         __m512 quarter[3];
         for (int i = 0; i < 3; i++) {
-            const P<R>* four = v + 4 * i;
+            const __m512 last_two = halves((__m512)v[i < 2 ? 4 * i + 2 : 8].v, (__m512)v[i < 2 ? 4 * i + 3 : 9].v);
             // lanes 4q..4q+3: the four partial sums of vector q
-            quarter[i] = halves(halves((__m512)four[0].v, (__m512)four[1].v), halves((__m512)four[2].v, (__m512)four[3].v));
+            quarter[i] = i < 2 ? halves(halves((__m512)v[4 * i].v, (__m512)v[4 * i + 1].v), last_two) : halves(last_two, last_two);
         }
         const __m512 last = pairs(pairs(quarter[0], quarter[1]), pairs(quarter[2], quarter[2]));
         // quad q: vector q of quarters 0, 1, 2, 2
         const __m512i in_order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-        _mm512_mask_storeu_ps(out, 0x0FFF, _mm512_permutexvar_ps(in_order, last));
+        _mm512_mask_storeu_ps(out, (1 << kSums) - 1, _mm512_permutexvar_ps(in_order, last));
         return;
     }
 #endif
-    for (int q = 0; q < kSlot; q++) out[q] = sum(v[q]);
+    for (int q = 0; q < kSums; q++) out[q] = sum(v[q]);
 }
 
 // Rows of pixels become blocks; outside the image they are 0.
@@ -109,7 +109,7 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         const int j = first + i;
         if (j >= kAhead) {
             __builtin_prefetch(&args.records[args.ids[begin + j - kAhead]]);
-            __builtin_prefetch(all.sums + slot_of(j - kAhead) * kSlot, 1);
+            __builtin_prefetch(all.sums + slot_of(j - kAhead) * kSums, 1);
         }
         uint32_t mask = args.masks[begin + j] & heard;
         all.written[slot_of(j)] = mask != 0;
@@ -126,10 +126,10 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
             const P<R> before = load<kLanes>(light[b]) / (p16(R(1)) - alpha), weight = alpha * before;
             store(light[b], before);
             const P<R> g0 = load<kLanes>(up[0][b]), g1 = load<kLanes>(up[1][b]), g2 = load<kLanes>(up[2][b]);
-            P<R> own = fma(g0, p16(entry.red), fma(g1, p16(entry.green), g2 * p16(entry.blue)));
+            P<R> own = fma(g0, p16(entry.look.red), fma(g1, p16(entry.look.green), g2 * p16(entry.look.blue)));
             if constexpr (Extra) {
                 const P<R> g4 = load<kLanes>(up[4][b]);
-                own = fma(g4, p16(entry.depth), own + load<kLanes>(up[3][b]));
+                own = fma(g4, p16(entry.look.depth), own + load<kLanes>(up[3][b]));
                 depth = fma(weight, g4, depth);
             }
             const P<R> back = load<kLanes>(behind[b]), gain = own - back;
@@ -140,8 +140,8 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
             err = fma(ge_r, d.r, err), ers = fma(ge_r, d.s, ers), ess = fma(ge_s, d.s, ess);
             red = fma(weight, g0, red), green = fma(weight, g1, green), blue = fma(weight, g2, blue);
         }
-        const P<R> totals[kSlot] = {e, er, es, err, ers, ess, red, green, blue, depth, zero, zero};
-        sums_of_twelve(totals, all.sums + slot_of(j) * kSlot);
+        const P<R> totals[kSums] = {e, er, es, err, ers, ess, red, green, blue, depth};
+        add_lanes(totals, all.sums + slot_of(j) * kSums);
     }
     }
 }

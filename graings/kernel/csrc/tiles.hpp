@@ -22,14 +22,12 @@ template <class R>
 GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top) {
     using D = Vec<double, kBlocks>;
     const auto all = [](double x) { return splat<double, kBlocks>(x); };
-    const double sr = double(record.sr), sy = double(record.sy), dy = top + 2 - record.y, tilt = sr * record.slope;
+    const double sr = double(record.look.sr), sy = double(record.look.sy), dy = top + 2 - record.y, tilt = sr * record.slope;
     const D x = load<kBlocks>(kBlockX), y = load<kBlocks>(kBlockY);
     const D r = fma(all(sr), x, fma(all(-tilt), y, all(sr * ((left + 2 - record.x) - record.slope * dy))));
     store(entry.base_r, rounded<R>(r)), store(entry.base_s, rounded<R>(fma(all(sy), y, all(sy * dy))));
-    store(entry.lanes, fma(p16(record.sr), load<kLanes>(kColumns<R>), p16(R(-tilt)) * load<kLanes>(kRows<R>)));
-    entry.rise = record.sy, entry.opacity = record.opacity;
-    entry.red = record.red, entry.green = record.green, entry.blue = record.blue, entry.depth = record.depth;
-    entry.wide = record.sr, entry.lean = R(tilt), entry.flat = record.flat, entry.fall = record.fall, entry.level = record.level;
+    store(entry.lanes, fma(p16(record.look.sr), load<kLanes>(kColumns<R>), p16(R(-tilt)) * load<kLanes>(kRows<R>)));
+    entry.look = record.look, entry.lean = R(tilt);
 }
 
 // Blocks that a prepared entry reaches, one bit each: those where the least exponent over the rectangle of pixel
@@ -40,16 +38,16 @@ GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double
 template <class R>
 GRAINGS_INLINE uint32_t reached_blocks(const TileEntry<R>& entry) {
     constexpr R unit = sizeof(R) == 4 ? R(6e-5) : R(1e-13);
-    const P<R> r = load<kLanes>(entry.base_r), s = load<kLanes>(entry.base_s), wide = p16(entry.wide), rise = p16(entry.rise), lean = p16(entry.lean), back = p16(R(0)) - lean;
+    const P<R> r = load<kLanes>(entry.base_r), s = load<kLanes>(entry.base_s), wide = p16(entry.look.sr), rise = p16(entry.look.sy), lean = p16(entry.lean), back = p16(R(0)) - lean;
     const P<R> zero = p16(R(0)), high = p16(R(1.5)), low = p16(R(-1.5)), half = high * wide, edge = fma(p16(unit), wide + abs(lean), half);
     const auto least = [&](P<R> t, P<R> dy) {
         const P<R> u = max(abs(t) - edge, zero), v = fma(rise, dy, s);
         return fma(u, u, v * v);
     };
-    const P<R> flat = clamp(zero - p16(entry.flat) * s, low, high), t = fma(back, flat, r);
-    const P<R> side = select(t < zero, zero - half, half), fall = p16(entry.fall);
+    const P<R> flat = clamp(zero - p16(entry.look.flat) * s, low, high), t = fma(back, flat, r);
+    const P<R> side = select(t < zero, zero - half, half), fall = p16(entry.look.fall);
     const P<R> lowest = clamp(fma(lean, r - side, zero - rise * s) * fall, low, high);
-    return bits(min(least(t, flat), least(fma(back, lowest, r), lowest)) <= p16(entry.level));
+    return bits(min(least(t, flat), least(fma(back, lowest, r), lowest)) <= p16(entry.look.level));
 }
 
 // entries[b]: which of the masks have bit b.
@@ -70,12 +68,12 @@ template <class R> struct Distance { P<R> r, s; };
 
 template <class R>
 GRAINGS_INLINE Distance<R> distance(const TileEntry<R>& entry, int block, P<R> rows) {
-    return {load<kLanes>(entry.lanes) + p16(entry.base_r[block]), fma(p16(entry.rise), rows, p16(entry.base_s[block]))};
+    return {load<kLanes>(entry.lanes) + p16(entry.base_r[block]), fma(p16(entry.look.sy), rows, p16(entry.base_s[block]))};
 }
 
 template <class R>
 GRAINGS_INLINE P<R> uncapped_alpha(const TileEntry<R>& entry, const Distance<R>& d) {
-    return p16(entry.opacity) * exp2_minus(fma(d.r, d.r, d.s * d.s));
+    return p16(entry.look.opacity) * exp2_minus(fma(d.r, d.r, d.s * d.s));
 }
 
 // What decides whether an entry counts in a pixel. Light so faint that no sum in R can see it counts as none: so much
@@ -190,10 +188,10 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
                 const int j = __builtin_ctzll(list);
                 const TileEntry<R>& entry = chunk[j];
                 const P<R> weight = blend<R, Compat>(uncapped_alpha(entry, distance(entry, b, rows)), first + R(j), limits, t, going, latest);
-                red = fma(weight, p16(entry.red), red);
-                green = fma(weight, p16(entry.green), green);
-                blue = fma(weight, p16(entry.blue), blue);
-                depth = fma(weight, p16(entry.depth), depth);
+                red = fma(weight, p16(entry.look.red), red);
+                green = fma(weight, p16(entry.look.green), green);
+                blue = fma(weight, p16(entry.look.blue), blue);
+                depth = fma(weight, p16(entry.look.depth), depth);
             }
             store(light[b], t), store(open[b], going), store(last[b], latest);
             store(channels[0][b], red), store(channels[1][b], green), store(channels[2][b], blue), store(channels[3][b], depth);

@@ -10,7 +10,6 @@ constexpr int kTile = 16;    // edge of a tile in pixels
 constexpr int kBlocks = 16;  // 4x4-pixel blocks per tile, row by row
 constexpr int kLanes = 16;   // pixels per block, row by row
 constexpr int kSums = 10;    // partial sums per (tile, Gaussian)
-constexpr int kSlot = 12;    // room for them
 
 struct Camera {
     double rotation[9];  // world to camera, row by row
@@ -30,9 +29,13 @@ enum Status : uint8_t { kDrawn, kNonFinite, kZeroQuat, kBehind, kFaint, kOutside
 // alpha = opacity * 2^-((sr (dx - slope dy))^2 + (sy dy)^2); nothing is drawn where the exponent exceeds `level`.
 // `flat` = 1 / sy and `fall` = 1 / ((sr slope)^2 + sy^2) only tell where that exponent is least.
 template <class R>
+struct Look {
+    R sr, sy, opacity, red, green, blue, depth, level, flat, fall;
+};
+template <class R>
 struct alignas(64) Record {
     double x, y, slope;
-    R sr, sy, opacity, red, green, blue, depth, level, flat, fall;
+    Look<R> look;
 };
 static_assert(sizeof(Record<float>) == 64);
 
@@ -44,13 +47,13 @@ struct Span {
 };
 
 // A record seen from one tile. With a pixel's place in its block, r = base_r[block] + lanes[pixel] and
-// s = base_s[block] + rise * row are the scaled distances; the bases are rounded from float64, where large numbers may
+// s = base_s[block] + sy * row are the scaled distances; the bases are rounded from float64, where large numbers may
 // cancel.
 template <class R>
 struct alignas(64) TileEntry {
     R lanes[kLanes], base_r[kBlocks], base_s[kBlocks];
-    R rise, opacity, red, green, blue, depth;
-    R wide, lean, flat, fall, level;  // for the blocks it reaches
+    Look<R> look;
+    R lean;  // sr slope
 };
 
 template <class R>
@@ -95,7 +98,7 @@ struct TileGradientArgs {
     TileArgs<R> tiles;
     const uint32_t* slots;             // where the sums of an entry go: contiguous per Gaussian, in tile order
     const R *v_color, *v_alpha, *v_depth;  // the last two may be null
-    R* sums;                           // [slot, kSlot]
+    R* sums;                           // [slot, kSums]
     uint8_t* written;                  // [slot]: whether there are sums; there are none where all are 0
     double* v_background;              // [tile, 3] or null
 };
