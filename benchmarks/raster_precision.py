@@ -13,12 +13,12 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import scenes
 import torch
 from matplotlib import pyplot
 from torch import Tensor
@@ -32,9 +32,6 @@ from graings.raster import reference
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
 from graings.threads import use_threads
-
-sys.path.insert(0, str(Path(__file__).parent))
-from rasterize import load
 
 ALPHA_MINS = (1 / 64, 1 / 255, 1 / 512, 1 / 1024, 1 / 4096, 1e-6)
 TRANSMITTANCES = (1e-2, 1e-3, 1e-4, 1e-6, 0.0)
@@ -77,8 +74,8 @@ def scaled(camera: Camera, factor: float) -> Camera:
 class Bench:
     """One scene and camera, with the picture everything is compared with."""
 
-    def __init__(self, scenes: Any, count: int, size: int, rounds: int) -> None:
-        raw, view = scenes.make_scene(count), scenes.camera(size)
+    def __init__(self, generator: Any, count: int, size: int, rounds: int) -> None:
+        raw, view = generator.make_scene(count), generator.camera(size)
         values = {name: torch.from_numpy(raw[name]) for name in ("means", "quats", "opacities", "colors")}
         self.gaussians = Gaussians(**values, log_scales=torch.from_numpy(raw["scales"]).log(), uids=torch.arange(count))
         self.camera = Camera(view["viewmat"], view["fx"], view["fy"], view["cx"], view["cy"], view["W"], view["H"])
@@ -118,9 +115,9 @@ class Bench:
         return back[0].permute(1, 2, 0)
 
 
-def floor(scenes: Any) -> float:
+def floor(generator: Any) -> float:
     """Largest difference of the reference to the torch oracle, on a small scene."""
-    small = Bench(scenes, 300, 64, 1)
+    small = Bench(generator, 300, 64, 1)
     double = cast(small.gaussians, torch.float64)
     oracle = reference.rasterize(double, small.camera, torch.zeros(3, dtype=torch.float64), settings=EXACT).color
     return float((oracle - small.truth).abs().max())
@@ -178,12 +175,12 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=400)
     parser.add_argument("--rounds", type=int, default=9)
     options = parser.parse_args()
-    scenes = load(options.yardstick, "bench_scene")
-    if scenes is None:
+    generator = scenes.module_of(options.yardstick, "bench_scene")
+    if generator is None:
         parser.error(f"{options.yardstick / 'bench_scene.py'} not found: give its folder with --yardstick")
-    disagreement = floor(scenes)
+    disagreement = floor(generator)
     print(f"reference against oracle: {disagreement:.1e}")
-    bench = Bench(scenes, options.gaussians, options.size, options.rounds)
+    bench = Bench(generator, options.gaussians, options.size, options.rounds)
     cores = kernel.usable_cores()
     render = [
         bench.point("alpha_min", f"{a:.1e}", settings=replace(DEFAULT, alpha_min=a), threads=cores) for a in ALPHA_MINS

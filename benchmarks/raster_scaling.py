@@ -13,18 +13,16 @@ import argparse
 import json
 import math
 import statistics
-import sys
 from pathlib import Path
 from typing import Any
 
+import scenes
 import torch
 from matplotlib import pyplot
+from rasterize import Ours
 
 from graings import kernel
 from graings.threads import use_threads
-
-sys.path.insert(0, str(Path(__file__).parent))
-from rasterize import Ours, load
 
 COUNTS = (10_000, 25_000, 50_000, 100_000, 200_000)
 SIZES = (200, 400, 800, 1600)
@@ -57,14 +55,10 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--rounds", type=int, default=11)
     options = parser.parse_args()
-    scenes = load(options.yardstick, "bench_scene")
-    if scenes is None:
-        parser.error(f"{options.yardstick / 'bench_scene.py'} not found: give its folder with --yardstick")
 
     def measure(count: int, size: int, threads: int) -> dict[str, float]:
         use_threads(threads)
-        raw, view = scenes.make_scene(count), scenes.camera(size)
-        return stages(Ours(raw, view, torch.from_numpy(scenes.target_image(size, size))), options.rounds)
+        return stages(Ours(scenes.named(f"{count}/{size}", options.yardstick)), options.rounds)
 
     cores = kernel.usable_cores()
     series: dict[str, dict[int, dict[str, float]]] = {

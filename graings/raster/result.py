@@ -17,9 +17,12 @@ from graings import constants
 class RasterSettings:
     """Constants of one call; the defaults define the picture (`graings.constants`).
 
-    `alpha_min = transmittance_min = 0` is the untruncated sum of Eq. (2). `compat` is for comparison with
-    public rasterizers only: exclusive stop (the Gaussian that would cross the line is not blended) and the
-    square footprint of three standard deviations.
+    `alpha_min = transmittance_min = 0` is the untruncated sum of Eq. (2), but for light below 1e-30 (1e-290 in
+    double), which no sum can see. `compat` is for comparison with public rasterizers only: exclusive stop (the
+    Gaussian that would cross the line is not blended) and the square footprint of three standard deviations.
+
+    Raises `ValueError` for what no picture can be drawn with; `alpha_max` is below 1 because the gradient goes back
+    through 1 - alpha.
     """
 
     alpha_min: float = constants.ALPHA_MIN
@@ -30,6 +33,16 @@ class RasterSettings:
     far: float = constants.FAR
     frustum_margin: float = constants.FRUSTUM_MARGIN
     compat: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.alpha_min < self.alpha_max < 1:
+            raise ValueError(f"0 <= alpha_min < alpha_max < 1 expected, got {self.alpha_min} and {self.alpha_max}")
+        if not 0 <= self.transmittance_min < 1:
+            raise ValueError(f"transmittance_min must lie in [0, 1), got {self.transmittance_min}")
+        if not 0 <= self.near < self.far:
+            raise ValueError(f"0 <= near < far expected, got {self.near} and {self.far}")
+        if not (self.blur >= 0 and self.frustum_margin >= 0):
+            raise ValueError(f"blur and frustum_margin must not be negative, got {self.blur} and {self.frustum_margin}")
 
 
 DEFAULT_SETTINGS = RasterSettings()

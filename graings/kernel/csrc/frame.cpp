@@ -29,6 +29,7 @@ private:
     std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
 };
 
+constexpr int64_t kMostEntries = 1 << 24;  // of a tile: their numbers are kept in R
 constexpr int64_t kPiece = 512;  // Gaussians handed to a thread at a time
 
 int64_t pieces_of(int64_t count, int64_t piece) { return (count + piece - 1) / piece; }
@@ -139,6 +140,7 @@ std::vector<Piece> Frame<R>::project(const ProjectArgs<R>& args, int threads) {
         begin_[tile + 1] = begin_[tile];
         for (const auto& mine : counts)
             if (!mine.empty()) begin_[tile + 1] += mine[tile];
+        if (begin_[tile + 1] - begin_[tile] > kMostEntries) throw std::length_error("more than 2^24 Gaussians on one tile");
     }
     return pieces;
 }

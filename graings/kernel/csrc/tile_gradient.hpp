@@ -101,20 +101,16 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
 
     constexpr int kAhead = 32;  // entries prepared at a time; meanwhile the memory of the next ones comes near
     TileEntry<R> chunk[kAhead];
-    const auto slot_of = [&](int j) { return size_t(all.slots[begin + j]); };
-    for (int first = (n - 1) / kAhead * kAhead; n > 0 && first >= 0; first -= kAhead) {
-    const int count = n - first < kAhead ? n - first : kAhead;
-    for (int i = 0; i < count; i++) prepare(chunk[i], args.records[args.ids[begin + first + i]], double(box.left), double(box.top));
-    for (int i = count - 1; i >= 0; i--) {
-        const int j = first + i;
-        if (j >= kAhead) {
-            __builtin_prefetch(&args.records[args.ids[begin + j - kAhead]]);
-            __builtin_prefetch(all.sums + slot_of(j - kAhead) * kSums, 1);
-        }
+    const auto record_of = [&](int j) -> const Record<R>& { return args.records[args.ids[begin + j]]; };
+    const auto sums_of = [&](int j) { return all.sums + size_t(all.slots[begin + j]) * kSums; };
+    for (int j = n - 1; j >= 0; j--) {
+        if (j == n - 1 || j % kAhead == kAhead - 1)
+            for (int i = j / kAhead * kAhead; i <= j; i++) prepare(chunk[i % kAhead], record_of(i), double(box.left), double(box.top));
+        if (j >= kAhead) __builtin_prefetch(&record_of(j - kAhead)), __builtin_prefetch(sums_of(j - kAhead), 1);
         uint32_t mask = args.masks[begin + j] & heard;
-        all.written[slot_of(j)] = mask != 0;
+        all.written[all.slots[begin + j]] = mask != 0;
         if (!mask) continue;
-        const TileEntry<R>& entry = chunk[i];
+        const TileEntry<R>& entry = chunk[j % kAhead];
         P<R> e = zero, er = zero, es = zero, err = zero, ers = zero, ess = zero;
         P<R> red = zero, green = zero, blue = zero, depth = zero;
         for (; mask; mask &= mask - 1) {
@@ -141,8 +137,7 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
             red = fma(weight, g0, red), green = fma(weight, g1, green), blue = fma(weight, g2, blue);
         }
         const P<R> totals[kSums] = {e, er, es, err, ers, ess, red, green, blue, depth};
-        add_lanes(totals, all.sums + slot_of(j) * kSums);
-    }
+        add_lanes(totals, sums_of(j));
     }
 }
 
