@@ -128,7 +128,7 @@ class _Rasterize(torch.autograd.Function):
         height, width = ctx.size
         upstream = means.new_zeros(height, width, 3) if v_color is None else _ready(v_color)
         inputs = (means, quats, log_scales, opacities, colors)
-        gradients = [torch.empty_like(t) for t in inputs]
+        gradients: list[Tensor | None] = [torch.empty_like(t) for t in inputs]
         gradients.append(torch.empty_like(ground) if ctx.needs_input_grad[len(inputs)] else None)
         v_shift = None if shift is None else torch.empty_like(shift)
         extra = [None if v is None else _ready(v) for v in (v_alpha, v_depth)]

@@ -41,8 +41,8 @@ class RasterSettings:
             raise ValueError(f"transmittance_min must lie in [0, 1), got {self.transmittance_min}")
         if not 0 <= self.near < self.far:
             raise ValueError(f"0 <= near < far expected, got {self.near} and {self.far}")
-        if not (self.blur >= 0 and self.frustum_margin >= 0):
-            raise ValueError(f"blur and frustum_margin must not be negative, got {self.blur} and {self.frustum_margin}")
+        if not (self.blur >= 0 and self.frustum_margin >= -1):
+            raise ValueError(f"blur >= 0 and frustum_margin >= -1 expected, got {self.blur} and {self.frustum_margin}")
 
 
 DEFAULT_SETTINGS = RasterSettings()

@@ -93,7 +93,7 @@ def test_silent_blocks_have_no_say_and_a_nan_is_not_silence() -> None:
         ({"alpha_min": 0.995}, "0 <= alpha_min < alpha_max < 1"),
         ({"transmittance_min": 1.0}, r"transmittance_min must lie in \[0, 1\), got 1.0"),
         ({"near": 2.0, "far": 1.0}, "0 <= near < far expected, got 2.0 and 1.0"),
-        ({"blur": -1.0}, "blur and frustum_margin must not be negative"),
+        ({"blur": -1.0}, "blur >= 0 and frustum_margin >= -1 expected, got -1.0"),
     ],
 )
 def test_settings_no_picture_can_be_drawn_with_are_named(change: dict[str, float], message: str) -> None:
