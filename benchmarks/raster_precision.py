@@ -37,6 +37,7 @@ ALPHA_MINS = (1 / 64, 1 / 255, 1 / 512, 1 / 1024, 1 / 4096, 1e-6)
 TRANSMITTANCES = (1e-2, 1e-3, 1e-4, 1e-6, 0.0)
 EXACT = RasterSettings(alpha_min=1e-9, transmittance_min=0.0)
 DEFAULT = RasterSettings()
+EXACTLY = 1e-17
 
 
 @dataclass(frozen=True)
@@ -132,34 +133,57 @@ def pareto(points: list[Point]) -> list[Point]:
     return front
 
 
+def shown(rmse: float) -> float:
+    """Where an error is drawn: a logarithmic axis has no place for the reference itself."""
+    return max(rmse, EXACTLY)
+
+
 def draw(axis: Any, points: list[Point], title: str, xlabel: str, scale: float) -> None:
     for group in dict.fromkeys(point.group for point in points):
         mine = [point for point in points if point.group == group]
         line = axis.loglog(
-            [p.ms * scale for p in mine], [p.rmse for p in mine], marker="o", markersize=4, linewidth=1, label=group
+            [p.ms * scale for p in mine], [shown(p.rmse) for p in mine], marker="o", markersize=4, linewidth=1
         )
-        for p in mine:
-            axis.annotate(
-                p.label,
-                (p.ms * scale, p.rmse),
-                fontsize=7,
-                xytext=(4, 3),
-                textcoords="offset points",
-                color=line[0].get_color(),
-            )
+        line[0].set_label(group)
     front = pareto(points)
     axis.step(
         [p.ms * scale for p in front],
-        [p.rmse for p in front],
+        [shown(p.rmse) for p in front],
         where="post",
         color="0.75",
         linewidth=4,
         zorder=0,
         label="Pareto front",
     )
-    axis.set(title=title, xlabel=xlabel, ylabel="RMSE against float64 without cut-offs")
+    axis.set(title=title, xlabel=xlabel, ylabel=f"RMSE against float64 without cut-offs ({EXACTLY:.0e}: none)")
+    axis.margins(0.2, 0.12)
     axis.grid(True, which="major", color="0.92")
     axis.legend(fontsize=8, frameon=False)
+
+
+def label(axis: Any, points: list[Point], scale: float) -> None:
+    """Names the points once the axes have their size: those that lie on each other share a label, none covers one."""
+    places = axis.transData.transform([(p.ms * scale, shown(p.rmse)) for p in points])
+    clusters: list[tuple[Any, list[str]]] = []
+    for place, point in zip(places, points, strict=True):
+        near = next((names for other, names in clusters if abs(other - place).max() < 9), None)
+        name = f"{point.group} {point.label}"
+        if near is None:
+            clusters.append((place, [name]))
+        elif name not in near:
+            near.append(name)
+    taken: list[tuple[float, float, float]] = []
+    for (x, y), names in sorted(clusters, key=lambda cluster: float(cluster[0][1])):
+        text = ", ".join(names if len(names) < 4 else [*names[:2], f"{len(names) - 2} more"])
+        low, width = y + 5, 4.4 * len(text)
+        while any(abs(low - other) < 10 and x < right and left < x + width for left, other, right in taken):
+            low += 10
+        taken.append((x, low, x + width))
+        note = axis.annotate(
+            text, axis.transData.inverted().transform((x, y)), xytext=(4, (low - y) * 0.72), textcoords="offset points",
+            fontsize=6.5, color="0.3", arrowprops={"arrowstyle": "-", "color": "0.8", "linewidth": 0.5},
+        )  # fmt: skip
+        note.set_in_layout(False)
 
 
 def _part(kind: str, points: list[Point]) -> dict[str, Any]:
@@ -208,7 +232,7 @@ def main() -> None:
             f"{point.group:<22} {point.label:<14} {point.ms:8.2f} ms  rmse {point.rmse:.2e}  max {point.worst:.2e}  "
             f"8-bit changed {point.changed:.2%}"
         )
-    figure, axes = pyplot.subplots(1, 2, figsize=(15, 6), layout="constrained")
+    figure, axes = pyplot.subplots(1, 2, figsize=(16, 8), layout="constrained")
     draw(axes[0], render, "A frame", "milliseconds", 1.0)
     draw(
         axes[1],
@@ -217,6 +241,9 @@ def main() -> None:
         "nanoseconds per pair of pixel and Gaussian that the default evaluates",
         1e6 / bench.pairs,
     )
+    figure.canvas.draw()
+    label(axes[0], render, 1.0)
+    label(axes[1], variants, 1e6 / bench.pairs)
     figure.suptitle(f"Error against time, {options.gaussians:,} Gaussians at {options.size} px")
     options.output.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.output / "raster_precision.svg")
