@@ -14,13 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+_EXACT = 1e-12  # an orthonormal matrix in float64 is no worse, so that one that was made exact stays as it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A pinhole camera.
 
-    `world_to_camera` is [4, 4] float64 and rigid; `fx, fy, cx, cy` are in pixels;
+    `world_to_camera` is [4, 4] float64 and rigid (a rotation rounded to single precision becomes the nearest exact
+    one: else the centre and the translation would disagree); `fx, fy, cx, cy` are in pixels;
     u = fx X/Z + cx, v = fy Y/Z + cy. Raises `ValueError` for anything a pinhole cannot be.
     """
 
@@ -48,6 +50,9 @@ class Camera:
             raise ValueError(f"intrinsics must be finite with fx, fy > 0, got {intrinsics}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"image size must be at least 1x1, got {self.width}x{self.height}")
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _EXACT:
+            left, _, right = np.linalg.svd(rotation)
+            pose[:3, :3] = left @ right
         pose.flags.writeable = False
         object.__setattr__(self, "world_to_camera", pose)
 
