@@ -7,10 +7,14 @@ temporary folder, the kernel is built again there where C++ changed, and the fas
 mutant that no test notices has survived, and the exit code is 1. The text to change must occur exactly once: after a
 formula has been rewritten, so must its mutant be, and the script says which.
 
-Mutants (a) to (h) break the rasterizer and are tried by tests/raster. Mutant (i) rounds times before they are
-normalised; the rasterizer knows no times, so it is tried by the tests of normalisation. Mutant (e) cuts a footprint at
-three standard deviations, which in this kernel is a limit of the exponent and not a square; mutant (g) takes
-the position in the camera in float32 where pixels are float32; mutant (h) forgets the uids, so that rows decide.
+All but one break the rasterizer and are tried by tests/raster. Mutant (i) rounds times before they are normalised; the
+rasterizer knows no times, so it is tried by the tests of normalisation. Mutant (e) cuts a footprint at three standard
+deviations, which in this kernel is a limit of the exponent and not a square; mutant (g) takes the position in the
+camera in float32 where pixels are float32; mutant (h) forgets the uids, so that rows decide; mutant (l) leaves flags as
+the memory was, which shows only where that was used before.
+
+Mutants (j) to (m) break the way back through a tile; (n) to (p) and the five that follow break in which tiles and
+blocks a Gaussian is looked at, and in which order.
 
 Tests that fail before anything is changed cannot notice a change: they are named and left out.
 Needs a compiler and CMake; takes a few minutes per mutant. Set GRAINGS_ISA to choose the instruction set that tests run
@@ -95,7 +99,13 @@ MUTANTS = (
         "fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30))",
         "fma(level, d8(1 + 1e-5), d8(1e-5)), d8(4.5 * kLog2E))",
     ),
-    Mutant("f", "slope missing in the gradient of y", GEOMETRY, "g_y = p.slope * e_r - load", "g_y = d8(0) - load"),
+    Mutant(
+        "f",
+        "slope missing in the gradient of y",
+        GEOMETRY,
+        "total[kS] * inverse_sy * p.inverse_c - p.slope * g_x",
+        "total[kS] * inverse_sy * p.inverse_c",
+    ),
     Mutant(
         "g",
         "geometry in float32",
@@ -132,18 +142,96 @@ MUTANTS = (
         ("tests/capture/test_normalize.py",),
     ),
     Mutant(
+        "j",
+        "light multiplied on the way back, not divided",
+        TILE_GRADIENT,
+        "load<kLanes>(light[b]) / (p16(R(1)) - alpha)",
+        "load<kLanes>(light[b]) * (p16(R(1)) - alpha)",
+    ),
+    Mutant(
+        "k",
+        "gradient counts entries behind the stop",
+        TILE_GRADIENT,
+        "(p16(limits.alpha_min) <= raw) & (p16(R(j)) <= load<kLanes>(last[b]))",
+        "p16(limits.alpha_min) <= raw",
+    ),
+    Mutant(
+        "l",
+        "sums taken for written behind the last entry seen",
+        TILE_GRADIENT,
+        "for (int64_t k = begin + n; k < end; k++) all.written[all.slots[k]] = 0;",
+        "",
+    ),
+    Mutant("m", "sign of the sum of s flipped", TILE_GRADIENT, "es = es + ge_s", "es = es - ge_s"),
+    Mutant(
+        "n",
+        "rectangle of tiles one too narrow on the right",
+        GEOMETRY,
+        "store(box[1], tile(last_x))",
+        "store(box[1], tile(last_x) - one)",
+    ),
+    Mutant(
+        "o",
+        "blocks judged by the point of least s alone",
+        TILES,
+        "min(least(t, flat), least(fma(back, lowest, r), lowest)) <=",
+        "least(t, flat) <=",
+    ),
+    Mutant(
+        "p",
+        "equal keys of depth taken for equal depths and uids",
+        FRAME,
+        "if (a.key != b.key) return a.key < b.key;",
+        "return a.key < b.key;",
+    ),
+    Mutant(
+        "depth-rounded",
+        "uids decide between depths of equal keys",
+        FRAME,
+        "std::tuple(depths[a.id], uids[a.id], a.id) < std::tuple(depths[b.id], uids[b.id], b.id)",
+        "std::tuple(uids[a.id], a.id) < std::tuple(uids[b.id], b.id)",
+    ),
+    Mutant(
+        "low-missing",
+        "blocks judged by the lowest point beside it alone",
+        TILES,
+        "min(least(t, flat), least(fma(back, lowest, r), lowest)) <=",
+        "least(fma(back, lowest, r), lowest) <=",
+    ),
+    Mutant(
+        "no-slack",
+        "blocks judged without slack for rounding",
+        TILES,
+        "edge = fma(p16(unit), wide + abs(lean), half)",
+        "edge = half",
+    ),
+    Mutant(
+        "row-narrow",
+        "rows of tiles end one tile early on the right",
+        FRAME,
+        "last = std::min(uint32_t(to) / kTile, span.right);",
+        "last = std::min((uint32_t(to) - 1) / kTile, span.right);",
+    ),
+    Mutant(
+        "tilt-missing",
+        "rows of tiles end as if there were no tilt",
+        FRAME,
+        "std::clamp(side * turn, low, high)",
+        "std::clamp(0.0, low, high)",
+    ),
+    Mutant(
         "slope-halved",
         "gradient of the slope halved",
         GEOMETRY,
-        "g_slope = -(load<kGroup>(sums[kRS])",
-        "g_slope = -(d8(0.5) * load<kGroup>(sums[kRS])",
+        "g_slope = total[kRS]",
+        "g_slope = d8(0.5) * total[kRS]",
     ),
     Mutant(
         "cap-passed",
         "gradient passed through the cap of alpha",
         TILE_GRADIENT,
-        "passing = max(signed_weight, zero);",
-        "passing = max(signed_weight, zero - signed_weight);",
+        "select(raw <= p16(limits.alpha_max), weight * gain, zero)",
+        "weight * gain",
     ),
     Mutant(
         "j-dropped",
@@ -156,8 +244,8 @@ MUTANTS = (
         "background",
         "background missing behind the last Gaussian",
         TILE_GRADIENT,
-        "sum_ = fma(g, p16(args.background[c]), sum_);",
-        "sum_ = fma(g, p16(R(0)), sum_);",
+        "ground = fma(g, p16(args.background[c]), ground);",
+        "ground = fma(g, p16(R(0)), ground);",
     ),
 )
 

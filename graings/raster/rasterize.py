@@ -6,6 +6,7 @@ with which the kernel agrees. Knows nothing of scenes, losses or files.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -49,12 +50,19 @@ def rasterize(
         means2d_offset,
     )
     workers = kernel.threads() if threads is None else threads
-    color, alpha, depth, means2d, radii, culled = _Rasterize.apply(*tensors, gaussians.uids, camera, settings, workers)  # type: ignore[no-untyped-call]
-    return RenderResult(color, alpha, depth, means2d, radii, culled)
+    if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors):
+        return RenderResult(*_Rasterize.apply(*tensors, gaussians.uids, camera, settings, workers))  # type: ignore[no-untyped-call]
+    inputs = [_prepared(tensor) for tensor in (*tensors, gaussians.uids)]
+    frame, images = _draw(inputs, camera, settings, workers, gradient=False)
+    return RenderResult(*images, frame.culled)
 
 
-def _ready(tensor: Tensor) -> Tensor:
-    return tensor.detach().contiguous()
+Images = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]  # of a `RenderResult`, in its order
+
+
+def _prepared(tensor: Tensor | None) -> Tensor | None:
+    """As the kernel takes it: without graph, one number after the other."""
+    return None if tensor is None else tensor.detach().contiguous()
 
 
 def _arrays(*tensors: Tensor | None) -> list[Any]:
@@ -62,58 +70,58 @@ def _arrays(*tensors: Tensor | None) -> list[Any]:
     return [None if tensor is None else tensor.numpy() for tensor in tensors]
 
 
+def _draw(
+    inputs: Sequence[Tensor | None], camera: Camera, settings: RasterSettings, threads: int, *, gradient: bool
+) -> tuple[Any, Images]:
+    """The kernel's frame, which keeps what a `gradient` needs, and the images.
+
+    `inputs` are prepared: means, quats, log_scales, opacities, colors, background, offset or None, uids.
+    """
+    means = inputs[0]
+    assert means is not None
+    n, height, width = len(means), camera.height, camera.width
+    color = means.new_empty(height, width, 3)
+    alpha, depth = means.new_empty(height, width), means.new_empty(height, width)
+    means2d, radii = means.new_empty(n, 2), means.new_empty(n, 2)
+    images = (color, alpha, depth, means2d, radii)
+    module = kernel.kernel()
+    draw = module.draw_float if means.dtype == torch.float32 else module.draw_double
+    frame = draw(
+        *_arrays(*inputs),
+        np.ascontiguousarray(camera.world_to_camera[:3, :3]),
+        camera.center,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        width,
+        height,
+        settings.alpha_min,
+        settings.transmittance_min,
+        settings.alpha_max,
+        settings.blur,
+        settings.near,
+        settings.far,
+        settings.frustum_margin,
+        settings.compat,
+        *_arrays(*images),
+        threads,
+        gradient,
+    )
+    return frame, images
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        log_scales: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        background: Tensor,
-        offset: Tensor | None,
-        uids: Tensor,
-        camera: Camera,
-        settings: RasterSettings,
-        threads: int,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
-        ready = [_ready(t) for t in (means, quats, log_scales, opacities, colors)]
-        shift = None if offset is None else _ready(offset)
-        ground = _ready(background)
-        n, height, width = len(means), camera.height, camera.width
-        color = means.new_empty(height, width, 3)
-        alpha, depth = means.new_empty(height, width), means.new_empty(height, width)
-        means2d, radii = means.new_empty(n, 2), means.new_empty(n, 2)
-        module = kernel.kernel()
-        draw = module.draw_float if means.dtype == torch.float32 else module.draw_double
-        frame = draw(
-            *_arrays(*ready, shift, ground, _ready(uids)),
-            np.ascontiguousarray(camera.world_to_camera[:3, :3]),
-            np.ascontiguousarray(camera.center),
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            width,
-            height,
-            settings.alpha_min,
-            settings.transmittance_min,
-            settings.alpha_max,
-            settings.blur,
-            settings.near,
-            settings.far,
-            settings.frustum_margin,
-            settings.compat,
-            *_arrays(color, alpha, depth, means2d, radii),
-            threads,
-        )
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
+        *tensors, camera, settings, threads = arguments
+        inputs = [_prepared(tensor) for tensor in tensors]
+        frame, images = _draw(inputs, camera, settings, threads, gradient=True)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(means2d, radii)
-        if any(ctx.needs_input_grad):
-            ctx.save_for_backward(*ready, ground, *([] if shift is None else [shift]))
-            ctx.frame, ctx.threads, ctx.size = frame, threads, (height, width)
-        return color, alpha, depth, means2d, radii, frame.culled
+        ctx.mark_non_differentiable(*images[3:])
+        ctx.save_for_backward(*inputs[:7])
+        ctx.frame, ctx.threads, ctx.size = frame, threads, (camera.height, camera.width)
+        return (*images, frame.culled)
 
     @staticmethod
     @once_differentiable
@@ -123,20 +131,19 @@ class _Rasterize(torch.autograd.Function):
         nothing: tuple[None, ...] = (None,) * 11
         if v_color is None and v_alpha is None and v_depth is None:
             return nothing
-        means, quats, log_scales, opacities, colors, ground, *rest = ctx.saved_tensors
-        shift = rest[0] if rest else None
+        means, quats, log_scales, opacities, colors, ground, shift = ctx.saved_tensors
         height, width = ctx.size
-        upstream = means.new_zeros(height, width, 3) if v_color is None else _ready(v_color)
+        upstream = means.new_zeros(height, width, 3) if v_color is None else v_color
         inputs = (means, quats, log_scales, opacities, colors)
         gradients: list[Tensor | None] = [torch.empty_like(t) for t in inputs]
         gradients.append(torch.empty_like(ground) if ctx.needs_input_grad[len(inputs)] else None)
         v_shift = None if shift is None else torch.empty_like(shift)
-        extra = [None if v is None else _ready(v) for v in (v_alpha, v_depth)]
+        upstreams = [_prepared(v) for v in (upstream, v_alpha, v_depth)]
         ctx.frame.gradient(
-            *_arrays(*inputs, shift, ground),
+            *_arrays(*inputs, ground, shift),
             height,
             width,
-            *_arrays(upstream, *extra, *gradients, v_shift),
+            *_arrays(*upstreams, *gradients, v_shift),
             ctx.threads,
         )
         return (*gradients, v_shift, None, None, None, None)

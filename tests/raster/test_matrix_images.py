@@ -6,10 +6,8 @@ has one size of them. B05 is left out: a count beyond 2^32 cannot be reached wit
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 import math
-import platform
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -384,19 +382,6 @@ def test_a_mirrored_scene_gives_the_mirrored_picture(name: str) -> None:
 
 
 # ---- B14: threads and memory
-
-
-@pytest.fixture
-def dirty_memory() -> Iterator[None]:
-    """Memory comes filled with 0xFF: not a number as float or double, -1 as an integer."""
-    if platform.libc_ver()[0] != "glibc":
-        pytest.skip("only glibc fills what it hands out")
-    mallopt = ctypes.CDLL(None).mallopt
-    perturb = -6
-    # glibc writes the complement of the lowest byte, and nothing where the whole number is 0
-    assert mallopt(perturb, 0x100) == 1
-    yield
-    mallopt(perturb, 0)
 
 
 @pytest.fixture(params=DTYPES, ids=["single", "double"])

@@ -139,7 +139,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         .def_prop_ro("pairs", &Frame<R>::pairs, "(tile, Gaussian) pairs")
         .def_prop_ro("evaluated", &Frame<R>::evaluated, "(pixel, Gaussian) pairs that were looked at")
         .def("gradient",
-             [](const Frame<R>& frame, In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, std::optional<In<R>> offset, In<R> background,
+             [](const Frame<R>& frame, In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, In<R> background, std::optional<In<R>> offset,
                 int64_t height, int64_t width, In<R> v_color, std::optional<In<R>> v_alpha, std::optional<In<R>> v_depth, Out<R> g_means, Out<R> g_quats, Out<R> g_log_scales,
                 Out<R> g_opacities, Out<R> g_colors, std::optional<Out<R>> g_background, std::optional<Out<R>> g_offset, int threads) {
                  const auto in = inputs<R>(means, quats, log_scales, opacities, colors, offset, background);
@@ -155,10 +155,10 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
                  frame.gradient(in, upstream, alpha, depth, out, threads);
              });
     m.def(draw_name,
-          [](In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, std::optional<In<R>> offset, In<R> background, In<int64_t> uids,
+          [](In<R> means, In<R> quats, In<R> log_scales, In<R> opacities, In<R> colors, In<R> background, std::optional<In<R>> offset, In<int64_t> uids,
              In<double> rotation, In<double> center, double fx, double fy, double cx, double cy, int64_t width, int64_t height, double alpha_min,
              double transmittance_min, double alpha_max, double blur, double near, double far, double frustum_margin, bool compat, Out<R> color, Out<R> alpha,
-             Out<R> depth, Out<R> means2d, Out<R> radii, int threads) {
+             Out<R> depth, Out<R> means2d, Out<R> radii, int threads, bool gradient) {
               const auto in = inputs<R>(means, quats, log_scales, opacities, colors, offset, background);
               const size_t n = size_t(in.count), pixels = size_t(height * width);
               graings::Camera camera{{}, {}, fx, fy, cx, cy, width, height};
@@ -169,7 +169,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
                                             checked(means2d, 2 * n, "means2d"), checked(radii, 2 * n, "radii")};
               const int64_t* ties = checked(uids, n, "uids");
               nb::gil_scoped_release release;
-              return new Frame<R>(camera, settings, in, ties, out, threads);
+              return new Frame<R>(camera, settings, in, ties, out, threads, gradient);
           },
           nb::rv_policy::take_ownership);
     m.def("network", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, Out<R> output, std::optional<Out<R>> hidden, int threads) {

@@ -72,7 +72,7 @@ bool is_small(const Span& span) { return span.count <= 16; }
 }  // namespace
 
 template <class R>
-Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads)
+Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads, bool gradient)
     : camera_(camera), settings_(settings), count_(in.count),
       tiles_(pieces_of(camera.width, kTile) * pieces_of(camera.height, kTile)), status_(size_t(in.count)),
       records_(size_t(in.count)), spans_(size_t(in.count)) {
@@ -88,7 +88,7 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
 
     const Kernels<R>& run = kernels<R>();
     processed_ = Buffer<int32_t>(size_t(tiles_)), items_ = Buffer<int32_t>(size_t(tiles_));
-    light_ = Buffer<R>(size_t(tiles_) * kBlocks * kLanes), last_ = Buffer<R>(size_t(tiles_) * kBlocks * kLanes);
+    if (gradient) light_ = Buffer<R>(size_t(tiles_) * kBlocks * kLanes), last_ = Buffer<R>(size_t(tiles_) * kBlocks * kLanes);
     TileArgs<R> tiles = tile_args(in.background);
     tiles.color = out.color, tiles.alpha = out.alpha, tiles.depth = out.depth;
     Buffer<TileEntry<R>> chunks(size_t(threads) * kChunk);
@@ -257,6 +257,7 @@ int64_t Frame<R>::evaluated() const {
 template <class R>
 void Frame<R>::gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha, const R* v_depth, const Gradients<R>& out, int threads) const {
     if (in.count != count_) throw std::invalid_argument("the gradient needs the Gaussians of the forward pass");
+    if (!light_.get()) throw std::invalid_argument("this frame was drawn without a gradient in mind");
     const Kernels<R>& run = kernels<R>();
     Stopwatch watch;
     Buffer<R> sums(size_t(pairs_) * kSums);

@@ -32,8 +32,8 @@ enum Stage { kProject, kSort, kBin, kBlend, kBlendGradient, kGeometryGradient, k
 template <class R>
 class Frame {
 public:
-    // `uids` break ties of depth. Keeps no pointer into `in` or `out`.
-    Frame(const Camera&, const Settings&, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads);
+    // `uids` break ties of depth. Keeps no pointer into `in` or `out`, and what a gradient needs only if there will be one.
+    Frame(const Camera&, const Settings&, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads, bool gradient);
 
     // `in` must hold the same values as in the forward pass. v_alpha, v_depth may be null.
     void gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha, const R* v_depth, const Gradients<R>& out, int threads) const;

@@ -112,25 +112,25 @@ GRAINGS_INLINE uint32_t open_lanes(const TileBox& box, R (*open)[kLanes]) {
 }
 
 // One step of light through a pixel. `light` is what still passes; a pixel below transmittance_min has stopped and
-// keeps it. In compat the entry that would cross is left out, and `open` remembers that the pixel has stopped. Returns
-// what the entry weighs; `last` remembers the number of the last entry that counted.
+// keeps it. In compat the entry that would cross is left out, and `open` remembers that the pixel has stopped.
+template <class R> struct Step { P<R> weight; Mask<R, kLanes> counts; };  // of the entry; whether the pixel had not stopped
+
 template <class R, bool Compat>
-GRAINGS_INLINE P<R> blend(P<R> raw, R number, const Rule<R>& rule, P<R>& light, P<R>& open, P<R>& last) {
+GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& open) {
     const P<R> zero = p16(R(0)), stop = p16(rule.transmittance_min), capped = min(raw, p16(rule.alpha_max));
     const auto drawn = p16(rule.alpha_min) <= raw;
     if constexpr (Compat) {
-        const auto going = zero < open;
-        const P<R> alpha = select(drawn & going, capped, zero), next = light * (p16(R(1)) - alpha);
+        const P<R> alpha = select(drawn & (zero < open), capped, zero), next = light * (p16(R(1)) - alpha);
         open = select(next < stop, zero, open);
         const auto counts = zero < open;
         const P<R> weight = select(counts, alpha * light, zero);
-        light = select(counts, next, light), last = select(counts, p16(number), last);
-        return weight;
+        light = select(counts, next, light);
+        return {weight, counts};
     } else {
         const auto counts = stop <= light;
         const P<R> alpha = select(drawn & counts, capped, zero), weight = alpha * light;
-        light = light * (p16(R(1)) - alpha), last = select(counts, p16(number), last);
-        return weight;
+        light = light * (p16(R(1)) - alpha);
+        return {weight, counts};
     }
 }
 
@@ -153,7 +153,7 @@ GRAINGS_INLINE void to_rows(const R (*blocks)[kBlocks][kLanes], const TileBox& b
     }
 }
 
-template <class R, bool Compat>
+template <class R, bool Compat, bool Keep>
 GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
     const TileBox box = tile_box(args.camera, tile);
     const Rule<R> limits = rule<R>(args.settings);
@@ -161,7 +161,8 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
     alignas(64) R open[kBlocks][kLanes], light[kBlocks][kLanes], last[kBlocks][kLanes], channels[4][kBlocks][kLanes];
     uint32_t live = open_lanes(box, open);
     std::memcpy(light, open, sizeof light);
-    for (int b = 0; b < kBlocks; b++) store(last[b], p16(R(-1)));
+    if constexpr (Keep)
+        for (int b = 0; b < kBlocks; b++) store(last[b], p16(R(-1)));
     std::memset(channels, 0, sizeof channels);
 
     int64_t k = args.begin[tile];
@@ -178,22 +179,25 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
             items += __builtin_popcount(masks[j]);
         }
         by_block(masks, lists);
-        const R first = R(k - start);
+        [[maybe_unused]] const R first = R(k - start);  // number in the tile
         for (int b = 0; b < kBlocks; b++) {
             if (lists[b] == 0) continue;
-            P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]), latest = load<kLanes>(last[b]);
+            P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]);
+            [[maybe_unused]] P<R> latest = Keep ? load<kLanes>(last[b]) : t;
             P<R> red = load<kLanes>(channels[0][b]), green = load<kLanes>(channels[1][b]);
             P<R> blue = load<kLanes>(channels[2][b]), depth = load<kLanes>(channels[3][b]);
             for (uint64_t list = lists[b]; list; list &= list - 1) {
                 const int j = __builtin_ctzll(list);
                 const TileEntry<R>& entry = chunk[j];
-                const P<R> weight = blend<R, Compat>(uncapped_alpha(entry, distance(entry, b, rows)), first + R(j), limits, t, going, latest);
+                const auto [weight, counts] = blend<R, Compat>(uncapped_alpha(entry, distance(entry, b, rows)), limits, t, going);
+                if constexpr (Keep) latest = select(counts, p16(first + R(j)), latest);
                 red = fma(weight, p16(entry.look.red), red);
                 green = fma(weight, p16(entry.look.green), green);
                 blue = fma(weight, p16(entry.look.blue), blue);
                 depth = fma(weight, p16(entry.look.depth), depth);
             }
-            store(light[b], t), store(open[b], going), store(last[b], latest);
+            store(light[b], t), store(open[b], going);
+            if constexpr (Keep) store(last[b], latest);
             store(channels[0][b], red), store(channels[1][b], green), store(channels[2][b], blue), store(channels[3][b], depth);
             if (!any(Compat ? p16(R(0)) < going : p16(limits.transmittance_min) <= t)) live &= ~(1u << b);
         }
@@ -201,7 +205,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
     }
     args.processed[tile] = int32_t(k - start);
     args.items[tile] = items;
-    if (args.light) {
+    if (Keep && args.light) {
         std::memcpy(args.light + tile * kBlocks * kLanes, light, sizeof light);
         std::memcpy(args.last + tile * kBlocks * kLanes, last, sizeof last);
     }
@@ -234,8 +238,9 @@ GRAINGS_INLINE void draw_background(const TileArgs<R>& args, int64_t tile) {
 template <class R>
 static void draw_tile(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
     if (args.begin[tile] == args.begin[tile + 1]) draw_background(args, tile);
-    else if (args.settings.compat) draw<R, true>(args, tile, chunk);
-    else draw<R, false>(args, tile, chunk);
+    else if (args.settings.compat) draw<R, true, true>(args, tile, chunk);
+    else if (args.light) draw<R, false, true>(args, tile, chunk);
+    else draw<R, false, false>(args, tile, chunk);
 }
 
 }  // namespace graings::GRAINGS_ISA

@@ -1,0 +1,88 @@
+"""Lists of tiles, blocks and entries only save work: what they leave out shows nowhere."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from graings.gaussians import Gaussians
+from graings.raster.rasterize import rasterize
+from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
+from tests.raster.comparison import draw, upstream
+from tests.scenes import cast, gaussians, pinhole, rows
+
+
+def test_the_least_difference_of_depth_decides_before_uids() -> None:
+    """Depths a billionth apart share their sorting key where others are far away."""
+    batch = gaussians(3, 29, spread=0.0, opacity=(0.9, 0.9))
+    means = torch.tensor([[0.0, 0.0, 2 + 1e-9], [0.0, 0.0, 2.0], [0.0, 0.0, 1e6]], dtype=torch.float64)
+    batch = replace(batch, means=means, uids=torch.arange(3))
+    color = rasterize(batch, pinhole(15, 15), torch.zeros(3, dtype=torch.float64), threads=1).color[7, 7]
+    assert (color - batch.colors[1]).norm() < (color - batch.colors[0]).norm()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("length", [1e0, 1e1, 1e2, 1e3, 1e4, 1e5])
+def test_only_the_pixel_decides_where_a_footprint_ends(length: float, dtype: torch.dtype, isa: str) -> None:
+    """Lists of tiles and blocks only save work: what is drawn is what is at least alpha_min with no list at all."""
+    camera = pinhole(200, 150, focal=100.0)
+    batch = gaussians(40, 70, spread=0.8, depth=(2.0, 2.0), opacity=(0.02, 0.9))
+    scales = torch.tensor([1.0, 1e-6, 1e-3], dtype=torch.float64) * length * 2.0 / camera.fx
+    batch = replace(batch, log_scales=scales.log().expand(40, 3).clone(), colors=torch.ones_like(batch.colors))
+    # half of them nearly along the rows of pixels: the steepest shear there is
+    turns = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64) + 1e-3 * batch.quats[:20]
+    batch = cast(replace(batch, quats=torch.cat([turns, batch.quats[20:]])), dtype)
+    background = torch.zeros(3, dtype=dtype)
+    everywhere = RasterSettings(alpha_min=0.0, transmittance_min=0.0)
+    for i in range(len(batch)):
+        alone = rows(batch, torch.tensor([i]))
+        raw = rasterize(alone, camera, background, settings=everywhere, threads=1).color[..., 0]
+        ours = rasterize(alone, camera, background, settings=DEFAULT_SETTINGS, threads=1).color[..., 0]
+        least = torch.tensor(DEFAULT_SETTINGS.alpha_min, dtype=dtype)
+        assert torch.equal(ours, torch.where(raw >= least, raw, 0.0)), i
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_memory_held_before_does_not_show_behind_the_stop_nor_in_silence(
+    dtype: torch.dtype, dirty_memory: None
+) -> None:
+    """Entries that no pixel reached, and tiles without an upstream, have no sums that could be read."""
+    batch, camera = gaussians(300, 71, spread=0.05, log_scales=(0.5, 1.0), opacity=(0.9, 0.95)), pinhole(40, 24)
+    silent = upstream(camera)
+    silent[:, 16:] = 0
+    for cotangent in (upstream(camera), silent, torch.zeros_like(silent)):
+        gradients = draw(rasterize, cast(batch, dtype), camera, cotangent).gradients
+        assert all(gradient.isfinite().all() for gradient in gradients.values())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_line_that_meets_blocks_in_their_corners_only_is_drawn_there(dtype: torch.dtype, isa: str) -> None:
+    """A needle thinner than rounding, along the diagonal: only the slack keeps blocks it meets in one corner."""
+    camera = pinhole(64, 64, focal=128.0)
+    random = torch.Generator().manual_seed(72)
+    background = torch.zeros(3, dtype=dtype)
+    least = torch.tensor(DEFAULT_SETTINGS.alpha_min, dtype=dtype)
+    met = 0
+    for i in range(300):
+        aside, width, angle = torch.rand(3, generator=random, dtype=torch.float64).tolist()
+        angle = math.pi / 8 + 1e-7 * (2 * angle - 1)
+        thin = replace(DEFAULT_SETTINGS, blur=1e-12 * (1 + width))
+        everywhere = replace(thin, alpha_min=0.0, transmittance_min=0.0)
+        # px beside the diagonal: right of the corners, where alpha falls to 1/255
+        aside = 3 + math.sqrt(1 + width) * (4.2e-6 + 1e-6 * aside)
+        one = Gaussians(
+            means=torch.tensor([[aside / 64, 0.0, 2.0]], dtype=dtype),
+            quats=torch.tensor([[math.cos(angle), 0.0, 0.0, math.sin(angle)]], dtype=dtype),
+            log_scales=torch.tensor([[5.0, -25.0, -25.0]], dtype=dtype),
+            opacities=torch.tensor([0.9], dtype=dtype),
+            colors=torch.ones(1, 3, dtype=dtype),
+            uids=torch.zeros(1, dtype=torch.int64),
+        )
+        raw = rasterize(one, camera, background, settings=everywhere, threads=1).color[..., 0]
+        ours = rasterize(one, camera, background, settings=thin, threads=1).color[..., 0]
+        assert torch.equal(ours, torch.where(raw >= least, raw, 0.0)), i
+        met += int((ours > 0).sum())
+    assert met > 100
