@@ -41,7 +41,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.encode": (),
     "graings.machine": ("graings", "graings.errors", "graings.kernel"),
     "graings.metrics": (),
-    "graings.report": ("graings.errors",),
+    "graings.drawing": (),
+    "graings.report": ("graings.drawing", "graings.errors"),
     "graings.plan": ("graings.capture.capture", "graings.config"),
     "graings.run_folder": ("graings.errors",),
     "graings.checkpoint": (
