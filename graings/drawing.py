@@ -27,7 +27,7 @@ SECONDS: Final = (
 DECIBELS: Final = (1, 2, 5, 10, 20)  # steps between grid lines
 
 # Colours are spelled out per theme: not every reader of SVG knows custom properties.
-STYLE: Final = """
+LIGHT: Final = """
 text { font-family: system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', 'DejaVu Sans', Arial, sans-serif;
        font-size: 12px; fill: #6a7178; font-variant-numeric: tabular-nums; }
 .title { font-size: 17px; font-weight: 600; fill: #20252a; }
@@ -39,7 +39,9 @@ text { font-family: system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', 'Dej
 .curve { fill: none; stroke: #0d6b83; stroke-width: 2; stroke-linejoin: round; stroke-linecap: round; }
 .point { fill: #fcfcfb; stroke: #0d6b83; stroke-width: 1.5; }
 .last { fill: #0d6b83; }
-@media (prefers-color-scheme: dark) {
+"""
+
+DARK: Final = """\
   text { fill: #9aa2aa; }
   .title, .label { fill: #e8eaec; }
   .value { fill: #62c6da; }
@@ -49,17 +51,21 @@ text { font-family: system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', 'Dej
   .curve, .point { stroke: #62c6da; }
   .point { fill: #16191c; }
   .last { fill: #62c6da; }
-}
 """
 
 
-def svg(width: float, height: float, title: str, body: Sequence[str], style: str = STYLE) -> str:
+def sheet(light: str = "", dark: str = "") -> str:
+    """The style sheet, with a picture's own rules after the common ones of each theme."""
+    return f"{LIGHT}{light}@media (prefers-color-scheme: dark) {{\n{DARK}{dark}}}\n"
+
+
+def svg(width: float, height: float, title: str, body: Sequence[str], style: str | None = None) -> str:
     """A whole picture of `width` x `height` pixels; `title` is what a screen reader says."""
     return "\n".join(
         [
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
             f'height="{height:g}" role="img" aria-label="{escape(title)}">',
-            f"<style>{style}</style>",
+            f"<style>{sheet() if style is None else style}</style>",
             f'<rect class="paper" width="{width:g}" height="{height:g}" rx="8"/>',
             *body,
             "</svg>\n",

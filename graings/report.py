@@ -20,6 +20,8 @@ from pydantic import BaseModel
 from graings.drawing import COUNTS, SECONDS, DecibelAxis, LogAxis, count, duration, line, mark, rule, svg, text
 from graings.errors import CheckpointError
 
+METRICS_SCHEMA: Final = "graings.metrics/1"
+
 WIDTH: Final = 960
 HEIGHT: Final = 400
 LEFT, RIGHT, TOP, BOTTOM = 66.0, 902.0, 96.0, 336.0
@@ -48,10 +50,15 @@ def read_metrics(path: Path) -> dict[str, Any]:
 
 def write_text(path: Path, text: str) -> None:
     """Replace a file at once: a reader sees the old text or the new one, also after a power cut."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """As `write_text`, for what is not text."""
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(name, 0o644)  # mkstemp makes files for the owner alone
