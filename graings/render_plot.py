@@ -14,7 +14,7 @@ from graings.plots import colour, filled, inks
 WIDTH: Final = 1200.0
 HEAD: Final = 80.0
 PANEL_HEIGHT: Final = 420.0
-COLUMNS: Final = ((70.0, 540.0), (670.0, 1140.0))  # left and right end of the two panels of a row
+COLUMNS: Final = ((70.0, 540.0), (670.0, 1140.0))  # left and right end of the two panels of a row; one spans both
 LABEL_HEIGHT: Final = 13.0
 
 SWEEPS: Final = {
@@ -22,9 +22,9 @@ SWEEPS: Final = {
     "alpha_min": "least alpha",
     "transmittance_min": "least transmittance",
 }
-MILLISECONDS: Final = tuple(
-    digit * 10.0**power for digit in (1, 5, 2, 3, 1.5, 7, 4, 6, 8, 9, 1.2, 2.5, 3.5) for power in range(-2, 6)
-)
+# The cut-offs change a frame by little: below the round numbers any with two digits is welcome.
+_DIGITS: Final = (1, 5, 2, 3, 4, 6, 7, 8, 9, 1.5, 2.5, *(tenths / 10 for tenths in range(11, 100)))
+MILLISECONDS: Final = tuple(digit * 10.0**power for digit in _DIGITS for power in range(-2, 6))
 ERRORS: Final = tuple(10.0**-power for power in range(10))
 LIGHT_RULES: Final = """\
 .front { fill: none; stroke: #d9dbda; stroke-width: 7; stroke-linejoin: round; }
@@ -41,7 +41,7 @@ def render_svg(parts: Sequence[Mapping[str, Any]]) -> str:
     if not parts:
         body.append(text(WIDTH / 2, HEAD + 40, "no model was drawn", anchor="middle"))
     for index, part in enumerate(parts):
-        left, right = COLUMNS[index % 2]
+        left, right = COLUMNS[index % 2] if len(parts) > 1 else (COLUMNS[0][0], COLUMNS[1][1])
         body += _panel(part, left, right, HEAD + PANEL_HEIGHT * (index // 2))
     rows = max((len(parts) + 1) // 2, 1)
     return svg(WIDTH, HEAD + PANEL_HEIGHT * rows, title, body, SHEET)
@@ -140,15 +140,15 @@ def _words(point: Mapping[str, Any]) -> str:
 
 
 def _labels(points: Sequence[Mapping[str, Any]], places: Sequence[tuple[float, float]]) -> list[str]:
-    """Names to the right of the marks, pushed down where they would cover a mark or one another."""
+    """Names above and to the right of the marks, where no line of a sweep goes, pushed up until they are free."""
     taken = [(x - 4, x + 4, y + 4) for x, y in places]
     parts = []
-    for i in sorted(range(len(points)), key=lambda i: places[i][1]):
-        x, y = places[i][0] + 8, places[i][1] + 4
+    for i in sorted(range(len(points)), key=lambda i: -places[i][1]):
+        x, y = places[i][0] + 6, places[i][1] - 5
         words = _name(points[i])
         end = x + 6.5 * len(words)
         while any(abs(y - other) < LABEL_HEIGHT and x < last and first < end for first, last, other in taken):
-            y += 2
+            y -= 2
         taken.append((x, end, y))
         parts.append(text(x, y, words, "small"))
     return parts
