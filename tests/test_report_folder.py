@@ -58,7 +58,7 @@ def model(run: Path) -> Model:
 
 
 def test_every_setting_is_measured_against_the_picture_without_cut_offs(model: Model) -> None:
-    part = render_part("tiny", model, budget_s=0.5)
+    part = render_part("tiny", model)
     points = part["points"]
     assert [p["setting"] for p in points] == [way.to_json() for way in settings()]
     assert part["views"] == {"split": "val", "names": ["view-0", "view-1"]}
