@@ -32,9 +32,11 @@ from graings.interrupt import Interrupt
 from graings.progress import TrainingProgress
 from graings.render import render
 from graings.report import read_metrics
+from graings.report_folder import report_runs
 from graings.threads import use_threads
 from graings.training.run import TrainingRun
 from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
+from graings.work_precision import summary
 
 MISSING: Final = 69
 EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (
@@ -123,7 +125,7 @@ def _train(run: TrainingRun) -> None:
         raise typer.Exit(interrupt.exit_code)
     for split, metrics in read_metrics(run.metrics_path)["splits"].items():
         _say_metrics(split, metrics)
-    _say(f"The model, metrics.json and curve.svg are in {run.folder}.")
+    _say(f"The model, metrics.json, curve.svg and report/ are in {run.folder}.")
     _say(f"Look at it: graings render {run.folder} --t 0.5 -o view.png")
 
 
@@ -194,6 +196,30 @@ def evaluate(
     use_threads(threads)
     _say_metrics(split, evaluate_run(run, split, capture).to_json())
     _say(f"Written to {run / 'metrics.json'}.")
+
+
+@app.command()
+def report(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or their metrics.json.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the report.")],
+    render: Annotated[
+        bool, typer.Option("--render/--no-render", help="Draw the models too: picture error against milliseconds.")
+    ] = True,
+    threads: Threads = None,
+) -> None:
+    """Compare runs: held-out error against seconds, iterations and Gaussians, as JSON, CSV, SVG and PNG."""
+    use_threads(threads)
+    try:
+        written = report_runs(runs, output, render=render)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="RUN") from error
+    for part in written.document["training"]:
+        _say(summary(part))
+        for problem in part["phases"]["problems"]:
+            _say(f"{part['run']['name']}: {problem}")
+    for note in written.notes:
+        _say(note)
+    _say(f"Written to {written.folder}: {', '.join(written.files)}.")
 
 
 @app.command(name="options")

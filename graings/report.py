@@ -1,8 +1,7 @@
 """Report: a run's numbers as strict JSON, and held-out error against run time as a drawing.
 
-The drawing is handwritten SVG without dependencies that follows the reader's light or dark theme. One line serves
-two axes: on the left the error, on the right the same number in decibels (PSNR = -20 log10 RMSE). Knows nothing of
-how numbers are made.
+One line of the drawing serves two axes: on the left the error, on the right the same number in decibels
+(PSNR = -20 log10 RMSE). Knows nothing of how numbers are made.
 """
 
 from __future__ import annotations
@@ -13,60 +12,21 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any, Final
 
 from pydantic import BaseModel
 
+from graings.drawing import COUNTS, SECONDS, DecibelAxis, LogAxis, count, duration, line, mark, rule, svg, text
 from graings.errors import CheckpointError
+
+METRICS_SCHEMA: Final = "graings.metrics/1"
 
 WIDTH: Final = 960
 HEIGHT: Final = 400
 LEFT, RIGHT, TOP, BOTTOM = 66.0, 902.0, 96.0, 336.0
 GUTTER: Final = 40.0  # between the two panels
 PANEL: Final = (RIGHT - LEFT - GUTTER) / 2
-LABEL_ROOM: Final = 44.0  # least distance of two labels on a horizontal axis
-
-# Round numbers for the axes, the most welcome first.
-COUNTS: Final = (
-    *(10.0**k for k in range(8)),
-    *(5 * 10.0**k for k in range(8)),
-    *(2 * 10.0**k for k in range(8)),
-)
-SECONDS: Final = (
-    *(1, 10, 60, 600, 3600, 36_000, 360_000, 0.1, 0.01, 0.001),
-    *(30, 1800, 18_000, 5, 300, 180_000, 0.5, 0.05),
-    *(2, 20, 120, 1200, 7200, 72_000, 0.2, 0.02),
-)
-DECIBELS: Final = (1, 2, 5, 10, 20)  # steps between grid lines
-
-# Colours are spelled out per theme: not every reader of SVG knows custom properties.
-STYLE: Final = """
-text { font-family: system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', 'DejaVu Sans', Arial, sans-serif;
-       font-size: 12px; fill: #6a7178; font-variant-numeric: tabular-nums; }
-.title { font-size: 17px; font-weight: 600; fill: #20252a; }
-.label { fill: #20252a; }
-.value { font-size: 13px; font-weight: 600; fill: #0d6b83; }
-.paper { fill: #fcfcfb; }
-.grid { stroke: #e6e7e5; stroke-width: 1; }
-.axis { stroke: #9aa0a6; stroke-width: 1; }
-.curve { fill: none; stroke: #0d6b83; stroke-width: 2; stroke-linejoin: round; stroke-linecap: round; }
-.point { fill: #fcfcfb; stroke: #0d6b83; stroke-width: 1.5; }
-.last { fill: #0d6b83; }
-@media (prefers-color-scheme: dark) {
-  text { fill: #9aa2aa; }
-  .title, .label { fill: #e8eaec; }
-  .value { fill: #62c6da; }
-  .paper { fill: #16191c; }
-  .grid { stroke: #2a2e33; }
-  .axis { stroke: #5b636b; }
-  .curve, .point { stroke: #62c6da; }
-  .point { fill: #16191c; }
-  .last { fill: #62c6da; }
-}
-"""
 
 
 def write_metrics(path: Path, document: Mapping[str, Any]) -> None:
@@ -78,9 +38,9 @@ def write_metrics(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
-    """A document written by `write_metrics`. Raises `CheckpointError`."""
+    """A document written by `write_metrics`. Raises `CheckpointError`, also for NaN and infinity."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{path}: not readable ({error}). Finish the training run first.") from error
     if not isinstance(document, dict):
@@ -90,10 +50,15 @@ def read_metrics(path: Path) -> dict[str, Any]:
 
 def write_text(path: Path, text: str) -> None:
     """Replace a file at once: a reader sees the old text or the new one, also after a power cut."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """As `write_text`, for what is not text."""
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(name, 0o644)  # mkstemp makes files for the owner alone
@@ -107,6 +72,10 @@ def config_hash(config: BaseModel) -> str:
     """sha256 over the canonical JSON of a configuration."""
     canonical = json.dumps(config.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} is not strict JSON")
 
 
 def _not_finite(value: Any, where: str) -> Iterator[str]:
@@ -127,131 +96,48 @@ def curve_svg(points: Sequence[Mapping[str, Any]]) -> str:
     Any number of points makes a picture, also none; those without a PSNR are left out.
     """
     drawn = [point for point in points if point["psnr"] is not None]
-    body = _plot(drawn) if drawn else [_text(WIDTH / 2, HEIGHT / 2, "no held-out view was evaluated", anchor="middle")]
+    body = _plot(drawn) if drawn else [text(WIDTH / 2, HEIGHT / 2, "no held-out view was evaluated", anchor="middle")]
     title = "Held-out error against run time"
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" '
-            f'height="{HEIGHT}" role="img" aria-label="{title}">',
-            f"<style>{STYLE}</style>",
-            f'<rect class="paper" width="{WIDTH}" height="{HEIGHT}" rx="8"/>',
-            _text(LEFT, 36, title, "title"),
-            *body,
-            "</svg>\n",
-        ]
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class _LogAxis:
-    """A logarithmic axis over `PANEL` pixels from `left` on, with a little air at both ends."""
-
-    low: float
-    high: float
-    left: float
-    ends: tuple[float, ...]  # the extreme values themselves
-
-    @staticmethod
-    def over(values: Sequence[float], left: float) -> _LogAxis:
-        smallest = min((value for value in values if value > 0), default=1.0)
-        largest = max(*values, smallest)
-        low, high = math.log(smallest), math.log(largest)
-        air = 0.04 * (high - low) if high > low else 1.0
-        ends = (smallest, largest) if high > low else (smallest,)
-        return _LogAxis(low - air, high + air, left, ends)
-
-    def at(self, value: float) -> float:
-        """Position in pixels; what lies below the axis (such as 0 seconds) sits at its start."""
-        share = (math.log(value) - self.low) / (self.high - self.low) if value > 0 else 0.0
-        return self.left + PANEL * max(share, 0.0)
-
-    def ticks(self, welcome: Sequence[float]) -> Sequence[float]:
-        """Round numbers on this axis that leave room for their labels."""
-        chosen: list[float] = []
-        for value in welcome:
-            inside = self.low <= math.log(value) <= self.high
-            if inside and all(abs(self.at(value) - self.at(other)) >= LABEL_ROOM for other in chosen):
-                chosen.append(value)
-        if len(chosen) < 2:  # a range so short that it holds no round numbers: name its ends
-            return self.ends
-        return chosen
+    return svg(WIDTH, HEIGHT, title, [text(LEFT, 36, title, "title"), *body])
 
 
 def _plot(points: Sequence[Mapping[str, Any]]) -> list[str]:
     decibels = [float(point["psnr"]) for point in points]
-    span = max(decibels) - min(decibels)
-    step = next((step for step in DECIBELS if span / step <= 6), DECIBELS[-1])
-    low = step * math.floor(min(decibels) / step - 0.1)
-    high = step * math.ceil(max(decibels) / step + 0.4)
-    levels = range(low, high + step, step)
-
-    def height(level: float) -> float:
-        return BOTTOM - (level - low) / (high - low) * (BOTTOM - TOP)
-
+    quality = DecibelAxis.over(decibels, TOP, BOTTOM)
     last = points[-1]
     summary = (
-        f"{last['psnr']:.2f} dB after {_duration(last['train_s'])} of training · {last['iteration']:,} iterations · "
+        f"{last['psnr']:.2f} dB after {duration(last['train_s'])} of training · {last['iteration']:,} iterations · "
         f"{last['gaussians']:,} Gaussians from {last['anchors']:,} anchors"
     )
-    parts = [
-        _text(LEFT, 58, summary),
-        _text(LEFT - 10, TOP - 16, "RMSE", "label", "end"),
-        _text(RIGHT + 10, TOP - 16, "PSNR", "label"),
-    ]
-    for level in levels:
-        parts.append(_text(LEFT - 10, height(level) + 4, _error(10 ** (-level / 20)), anchor="end"))
-        parts.append(_text(RIGHT + 10, height(level) + 4, f"{level} dB"))
+    parts = [text(LEFT, 58, summary), *quality.names(LEFT - 10, RIGHT + 10)]
     panels: tuple[tuple[str, str, Sequence[float], Callable[[float], str]], ...] = (
-        ("train_s", "training time", SECONDS, _duration),
-        ("iteration", "iterations", COUNTS, _count),
+        ("train_s", "training time", SECONDS, duration),
+        ("iteration", "iterations", COUNTS, count),
     )
     for index, (key, label, welcome, name) in enumerate(panels):
         left = LEFT + index * (PANEL + GUTTER)
         values = [float(point[key]) for point in points]
-        axis = _LogAxis.over(values, left)
-        parts += [_rule(left, height(level), left + PANEL, height(level)) for level in levels]
+        axis = LogAxis.over(values, left, PANEL)
+        parts += [rule(left, quality.at(level), left + PANEL, quality.at(level)) for level in quality.levels]
         for value in axis.ticks(welcome):
-            parts.append(_rule(axis.at(value), TOP, axis.at(value), BOTTOM))
-            parts.append(_text(axis.at(value), BOTTOM + 20, name(value), anchor="middle"))
-        parts.append(_rule(left, BOTTOM, left + PANEL, BOTTOM, "axis"))
-        parts.append(_text(left + PANEL / 2, BOTTOM + 44, label, "label", "middle"))
-        places = [(axis.at(value), height(level)) for value, level in zip(values, decibels, strict=True)]
-        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
-        parts.append(f'<polyline class="curve" points="{path}"/>')
-        parts += [_mark(place, point, last=point is last) for place, point in zip(places, points, strict=True)]
+            parts.append(rule(axis.at(value), TOP, axis.at(value), BOTTOM))
+            parts.append(text(axis.at(value), BOTTOM + 20, name(value), anchor="middle"))
+        parts.append(rule(left, BOTTOM, left + PANEL, BOTTOM, "axis"))
+        parts.append(text(left + PANEL / 2, BOTTOM + 44, label, "label", "middle"))
+        places = [(axis.at(value), quality.at(level)) for value, level in zip(values, decibels, strict=True)]
+        parts.append(line(places))
+        parts += [
+            mark(place, point_words(point), "point last" if point is last else "point")
+            for place, point in zip(places, points, strict=True)
+        ]
         x, y = places[-1]
-        parts.append(_text(x + 4, y - 13, f"{last['psnr']:.2f} dB", "value", "end"))
+        parts.append(text(x + 4, y - 13, f"{last['psnr']:.2f} dB", "value", "end"))
     return parts
 
 
-def _mark(place: tuple[float, float], point: Mapping[str, Any], *, last: bool) -> str:
-    x, y = place
-    words = (
+def point_words(point: Mapping[str, Any]) -> str:
+    """What one evaluation says when the pointer rests on it."""
+    return (
         f"{point['psnr']:.2f} dB, RMSE {point['rmse']:.4f}, SSIM {point['ssim_3dgs']:.4f}\n"
-        f"{_duration(point['train_s'])}, iteration {point['iteration']:,}\n{point['gaussians']:,} Gaussians"
+        f"{duration(point['train_s'])}, iteration {point['iteration']:,}\n{point['gaussians']:,} Gaussians"
     )
-    kind = "point last" if last else "point"
-    return f'<circle class="{kind}" cx="{x:.1f}" cy="{y:.1f}" r="3.2"><title>{escape(words)}</title></circle>'
-
-
-def _text(x: float, y: float, text: str, kind: str = "note", anchor: str = "start") -> str:
-    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
-
-
-def _rule(x1: float, y1: float, x2: float, y2: float, kind: str = "grid") -> str:
-    return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
-
-
-def _duration(seconds: float) -> str:
-    for length, unit in ((3600, "h"), (60, "min")):
-        if seconds >= length:
-            return f"{seconds / length:.3g} {unit}"
-    return f"{seconds:.3g} s"
-
-
-def _error(error: float) -> str:
-    return f"{error:.3f}" if error >= 0.01 else f"{error:.2g}"
-
-
-def _count(number: float) -> str:
-    return f"{number:.3g}" if number < 1000 else f"{number / 1000:.3g}k"

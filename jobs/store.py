@@ -58,6 +58,10 @@ class JobFolder:
     def curve(self) -> Path:
         return self.run / "curve.svg"
 
+    @property
+    def report(self) -> Path:
+        return self.run / "report"
+
     def spec(self) -> JobSpec:
         return JobSpec(**self._record()["spec"])
 

@@ -24,6 +24,7 @@ from typing import Any
 
 from graings.config import TrainConfig, restored
 from graings.errors import DivergedError, GraingsError
+from graings.report_folder import report_runs
 from graings.training.run import RunReport, TrainingRun
 from jobs.exit_code import ExitCode
 from jobs.files import locked
@@ -34,6 +35,7 @@ from jobs.store import JobFolder, Store
 REPORT_EVERY_S = 1.0
 LOG_EVERY_S = 15.0
 LOCK_WAIT_S = 60.0
+REPORT_BUDGET_S = 10.0  # of drawing the finished model for its report
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -107,8 +109,20 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
             path = run.save()
             _log(f"stopped at iteration {report.iteration}, checkpoint {path.name}")
             return ExitCode.STOPPED
+    _report(folder)
     _log("finished")
     return ExitCode.DONE
+
+
+def _report(folder: JobFolder) -> None:
+    """The whole work-precision report beside the model."""
+    try:
+        written = report_runs([folder.run], folder.report, budget_s=REPORT_BUDGET_S)
+        _log("; ".join([f"report: {', '.join(written.files)}", *written.notes]))
+    except Exception as error:
+        # The model is trained and saved: no trouble with describing it makes the job a failure.
+        traceback.print_exc()
+        _log(f"no report: {type(error).__name__}: {error}. Make it with: graings report {folder.run} -o DIR")
 
 
 def _values(report: RunReport) -> dict[str, Any]:

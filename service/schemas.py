@@ -76,7 +76,7 @@ def job_resource(job: Job) -> JobResource:
     if job.checkpoint is not None:
         links["render"] = f"/render?job={job.id}"
     if job.has_metrics:
-        links |= {"metrics": f"{base}/metrics", "curve": f"{base}/curve.svg"}
+        links |= {"metrics": f"{base}/metrics", "curve": f"{base}/curve.svg", "report": f"{base}/report"}
     return JobResource(
         id=job.id,
         name=job.spec.name,

@@ -202,7 +202,7 @@ def test_help_documents_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> No
     assert graings("--help") == 0
     page = " ".join(capsys.readouterr().out.split())
     assert "65 the capture or checkpoint cannot be used" in page
-    for verb in ("train", "render", "evaluate", "options"):
+    for verb in ("train", "render", "evaluate", "report", "options"):
         assert verb in page
 
 

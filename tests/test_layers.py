@@ -41,7 +41,21 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.encode": (),
     "graings.machine": ("graings", "graings.errors", "graings.kernel"),
     "graings.metrics": (),
-    "graings.report": ("graings.errors",),
+    "graings.drawing": (),
+    "graings.report": ("graings.drawing", "graings.errors"),
+    "graings.work_precision": ("graings.drawing", "graings.errors", "graings.report"),
+    "graings.tables": ("graings.work_precision",),
+    "graings.plots": ("graings.drawing", "graings.report"),
+    "graings.render_plot": ("graings.drawing", "graings.plots"),
+    "graings.picture": (),
+    "graings.render_precision": (
+        *("graings.camera", "graings.checkpoint", "graings.kernel", "graings.machine", "graings.raster.result"),
+        *("graings.render", "graings.scene", "graings.work_precision"),
+    ),
+    "graings.report_folder": (
+        *("graings.checkpoint", "graings.errors", "graings.picture", "graings.plots", "graings.render_plot"),
+        *("graings.render_precision", "graings.report", "graings.tables", "graings.work_precision"),
+    ),
     "graings.plan": ("graings.capture.capture", "graings.config"),
     "graings.run_folder": ("graings.errors",),
     "graings.checkpoint": (
@@ -56,6 +70,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.camera", "graings.checkpoint", "graings.config", "graings.constants", "graings.errors"),
         *("graings.evaluation", "graings.machine", "graings.metrics", "graings.plan", "graings.report"),
         *("graings.gaussians", "graings.run_folder", "graings.units", "graings.threads"),
+        *("graings.report_folder", "graings.work_precision"),
     ),
     # The terminal.
     "graings.progress": ("graings.training.run",),
@@ -63,12 +78,15 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.cli": (
         *("graings.camera", "graings.checkpoint", "graings.config", "graings.encode", "graings.errors"),
         *("graings.evaluation", "graings.interrupt", "graings.progress", "graings.render", "graings.report"),
-        *("graings.threads", "graings.training.run", "graings.viewpoint"),
+        *("graings.report_folder", "graings.threads", "graings.training.run", "graings.viewpoint"),
+        "graings.work_precision",
     ),
     "graings.__main__": ("graings.cli",),
     # Durable work knows the method by its options and its files; one child process knows how to train.
     "jobs": ("jobs", "graings.config", "graings.errors", "graings.run_folder"),
-    "jobs.trainer_process": ("jobs", "graings.errors", "graings.config", "graings.training.run"),
+    "jobs.trainer_process": (
+        *("jobs", "graings.errors", "graings.config", "graings.report_folder", "graings.training.run"),
+    ),
     # HTTP never trains.
     "service": (
         *("service", "jobs", "graings", "graings.camera", "graings.checkpoint", "graings.config", "graings.encode"),
@@ -88,11 +106,12 @@ HOMES: dict[str, tuple[str, ...]] = {
     "OpenImageIO": ("graings.capture", "graings.encode"),
     "pycolmap": ("graings.capture",),
     "lpips": ("graings.metrics",),
+    "matplotlib": ("graings.picture",),
     "safetensors": ("graings.checkpoint",),
 }
 
 # Optional extras: heavy, or absent from most machines.
-MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips"}
+MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "matplotlib"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 

@@ -68,7 +68,7 @@ def test_others_may_read_a_report(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "curve.svg").stat().st_mode) == 0o644
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]"])
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"train_s": NaN}', '{"train_s": -Infinity}'])
 def test_a_broken_document_is_named_with_a_remedy(tmp_path: Path, text: str) -> None:
     (tmp_path / "metrics.json").write_text(text)
     with pytest.raises(CheckpointError, match=r"metrics\.json.*Finish"):

@@ -5,9 +5,11 @@ Knows nothing of what is done in those seconds.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 
 from graings.config import TrainConfig
+from graings.work_precision import TRAINING_PHASES
 
 # The rate shown to the user is the mean over about this many recent seconds.
 RATE_WINDOW_S = 5.0
@@ -15,9 +17,15 @@ RATE_WINDOW_S = 5.0
 
 @dataclass(slots=True)
 class Clock:
-    """Seconds per phase; training, evaluation and saving never share a second."""
+    """Seconds per phase; training, evaluation and saving never share a second.
+
+    The wall clock beside them starts with the object, after the `before_s` of earlier sittings: what nobody booked
+    shows as a difference.
+    """
 
     seconds: dict[str, float] = field(default_factory=dict)
+    before_s: float = 0.0
+    _started: float = field(default_factory=time.perf_counter)
 
     def add(self, phase: str, seconds: float) -> None:
         """Book `seconds` on a phase of training or on load, evaluation or checkpoint."""
@@ -25,11 +33,15 @@ class Clock:
 
     def train_s(self) -> float:
         """Seconds of training alone."""
-        return sum(self.seconds.get(phase, 0.0) for phase in ("init", "warmup", "joint", "static"))
+        return sum(self.seconds.get(phase, 0.0) for phase in TRAINING_PHASES)
 
     def total_s(self) -> float:
         """Seconds of everything."""
         return sum(self.seconds.values())
+
+    def wall_s(self) -> float:
+        """Seconds on the wall, interruptions left out."""
+        return self.before_s + time.perf_counter() - self._started
 
 
 class Rate:

@@ -31,14 +31,15 @@ from graings.evaluation import evaluate, frames_per_second, subset
 from graings.machine import machine_facts, version_facts
 from graings.metrics import Lpips, SplitMetrics
 from graings.plan import Plan, make_plan
-from graings.report import config_hash, curve_svg, read_metrics, write_metrics, write_text
+from graings.report import METRICS_SCHEMA, config_hash, curve_svg, read_metrics, write_metrics, write_text
+from graings.report_folder import report_training
 from graings.run_folder import sole_trainer
 from graings.threads import use_threads
 from graings.training.pace import Clock, Rate, evaluation_marks
 from graings.training.trainer import StepReport, Trainer
+from graings.work_precision import run_names
 
 SCHEMA = "graings.run/1"
-METRICS_SCHEMA = "graings.metrics/1"
 
 # Frames per second are measured on this many views.
 FPS_VIEWS = 8
@@ -125,7 +126,8 @@ class TrainingRun:
         if newest_checkpoint(folder) is not None:
             state = load_state(folder)
             run._trainer.load(load_model(folder).scene, state.tensors, state.facts["trainer"])
-            run._clock = Clock(dict(state.facts["seconds"]))
+            seconds = dict(state.facts["seconds"])
+            run._clock = Clock(seconds, state.facts.get("wall_s", sum(seconds.values())))
             run._curve = list(state.facts["curve"])
             run._events = list(state.facts["events"])
             run._last_gaussians = int(state.facts["gaussians"])
@@ -186,6 +188,7 @@ class TrainingRun:
                 {
                     "trainer": facts,
                     "seconds": self._clock.seconds,
+                    "wall_s": self._clock.wall_s(),
                     "curve": self._curve,
                     "events": self._events,
                     "gaussians": self._last_gaussians,
@@ -257,6 +260,7 @@ class TrainingRun:
         return bool(document["iterations"] == self.iterations and (document["splits"] or not self.capture.val))
 
     def _write_run(self) -> None:
+        started = time.perf_counter()
         document = {
             "schema": SCHEMA,
             "capture": {
@@ -270,20 +274,27 @@ class TrainingRun:
             "versions": version_facts(),
         }
         write_metrics(self.folder / "run.json", document)
+        self._clock.add("report", time.perf_counter() - started)
 
     def _write_metrics(self, splits: dict[str, Any]) -> None:
+        started = time.perf_counter()
         scene, background = self._trainer.scene, self.config.capture.background_rgb()
+        fps = frames_per_second(scene, subset(self.capture.train, FPS_VIEWS), background)
+        machine, versions = machine_facts(self.threads), version_facts()
+        self._clock.add("report", time.perf_counter() - started)
+        started = time.perf_counter()
         document = {
             "schema": METRICS_SCHEMA,
             "splits": splits,
             "train_s": self._clock.train_s(),
             "total_s": self._clock.total_s(),
+            "wall_s": self._clock.wall_s(),
             "phases_s": dict(self._clock.seconds),
             "iterations": self.iteration,
             "gaussians": self._last_gaussians,
             "anchors": scene.scaffold.count,
             "bytes": {"fp32": scene_bytes(scene), "compact": None},
-            "render_fps": frames_per_second(scene, subset(self.capture.train, FPS_VIEWS), background),
+            "render_fps": fps,
             "curve": self._curve,
             "events": self._events,
             "plan": self.plan.to_json(),
@@ -296,10 +307,14 @@ class TrainingRun:
                 "notes": list(self.capture.notes),
             },
             "skipped_steps": self._trainer.guard.skipped,
-            "machine": machine_facts(self.threads),
-            "versions": version_facts(),
+            "machine": machine,
+            "versions": versions,
             "seed": self.config.seed,
             "hashes": {"config": config_hash(self.config), "capture": self.capture.content_hash},
         }
         write_metrics(self.metrics_path, document)
         write_text(self.folder / "curve.svg", curve_svg(self._curve))
+        name = run_names([self.folder])[0]
+        facts = {"config": self.config.model_dump(mode="json")}
+        report_training(name, document, facts, self.folder / "report")
+        self._clock.add("report", time.perf_counter() - started)

@@ -38,6 +38,22 @@ def curve(job_id: JobId, here: Here) -> Response:
     return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
 
 
+@router.get("/report", operation_id="get_report", response_class=Response)
+def report(job_id: JobId, here: Here) -> Response:
+    """The work-precision report, schema `graings.work_precision/1`: error against time, iterations and Gaussians."""
+    file = here.store.folder(job_id).report / "work_precision.json"
+    path = _existing(file, "report", "It comes with the first evaluation.")
+    return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
+
+
+@router.get("/report.svg", operation_id="get_report_picture", response_class=FileResponse)
+def report_picture(job_id: JobId, here: Here) -> Response:
+    """The work-precision report as a picture."""
+    file = here.store.folder(job_id).report / "training.svg"
+    path = _existing(file, "report", "It comes with the first evaluation.")
+    return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
+
+
 @router.get("/log", operation_id="get_log", response_class=PlainTextResponse)
 def log(job_id: JobId, here: Here, tail: Annotated[int, Query(ge=1, le=100_000)] = 1_000) -> Response:
     """The last `tail` lines of the trainer's log."""

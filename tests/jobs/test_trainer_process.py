@@ -4,17 +4,21 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import NoReturn
+
+import pytest
 
 from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
 from jobs.store import JobFolder, Store
+from jobs.trainer_process import _report
 
 
-def job(store: Store) -> JobFolder:
+def job(store: Store, iterations: int = 100_000) -> JobFolder:
     unpacked = write_synthetic(store.uploads / "u", frames=6, size=24)
-    config = make_config("draft", {"iterations": 100_000, "init.points": 300}).model_dump(mode="json")
+    config = make_config("draft", {"iterations": iterations, "init.points": 300}).model_dump(mode="json")
     return store.folder(store.create(JobSpec(name="job", capture="0" * 64, config=config), unpacked))
 
 
@@ -33,3 +37,24 @@ def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_p
         assert process.wait(60) == ExitCode.REFUSED
     assert "train/r_" in json.loads(said)["error"]
     assert folder.checkpoint() is None
+
+
+def test_a_finished_job_has_its_report(tmp_path: Path) -> None:
+    folder = job(Store(tmp_path), iterations=12)
+    with trainer(folder) as process:
+        assert process.wait(60) == ExitCode.DONE
+    document = json.loads((folder.report / "work_precision.json").read_text())
+    assert document["training"][0]["run"]["name"] == folder.path.name
+    assert len(document["render"][0]["points"]) > 1
+    assert {"training.svg", "render.svg", "points.csv"} < {path.name for path in folder.report.iterdir()}
+
+
+def test_trouble_with_the_report_is_logged_and_ends_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object, **__: object) -> NoReturn:
+        raise RuntimeError("no ink")
+
+    monkeypatch.setattr("jobs.trainer_process.report_runs", broken)
+    _report(job(Store(tmp_path)))
+    assert "no report: RuntimeError: no ink" in capsys.readouterr().err

@@ -128,14 +128,14 @@ def test_steering_follows_the_state_and_may_be_repeated(client: TestClient, job:
         problem(answer, 404)
 
 
-@pytest.mark.parametrize("path", ["", "/metrics", "/log", "/events", "/curve.svg"])
+@pytest.mark.parametrize("path", ["", "/metrics", "/log", "/events", "/curve.svg", "/report", "/report.svg"])
 @pytest.mark.parametrize("job_id", ["0123456789abcdef", "..%2f..%2fetc", "x"])
 def test_an_unknown_job_is_a_404_everywhere(client: TestClient, job_id: str, path: str) -> None:
     problem(client.get(f"/jobs/{job_id}{path}"), 404)
 
 
 def test_metrics_and_curve_come_when_there_are_any(client: TestClient, job: str, folder: JobFolder) -> None:
-    for path in ("metrics", "curve.svg"):
+    for path in ("metrics", "curve.svg", "report", "report.svg"):
         assert problem(client.get(f"/jobs/{job}/{path}"), 404)["type"] == "urn:graings:problem:not-yet"
         assert path.split(".")[0] not in client.get(f"/jobs/{job}").json()["links"]
 
@@ -145,9 +145,13 @@ def test_metrics_and_curve_of_a_trained_job(client: TestClient, model: str) -> N
     metrics = client.get(links["metrics"])
     assert metrics.json()["schema"] == "graings.metrics/1"
     assert metrics.headers["content-type"] == "application/json"
-    curve = client.get(links["curve"])
-    assert curve.headers["content-type"] == "image/svg+xml"
-    assert "<svg" in curve.text
+    report = client.get(links["report"])
+    assert report.json()["schema"] == "graings.work_precision/1"
+    assert report.headers["content-type"] == "application/json"
+    for address in (links["curve"], f"{links['report']}.svg"):
+        picture = client.get(address)
+        assert picture.headers["content-type"] == "image/svg+xml"
+        assert "<svg" in picture.text
 
 
 def test_the_log_shows_its_last_lines(client: TestClient, job: str, folder: JobFolder) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +14,8 @@ from graings.capture.synthetic import write_synthetic
 from graings.checkpoint import load_model, newest_checkpoint
 from graings.config import TrainConfig, make_config
 from graings.errors import CheckpointError
-from graings.evaluation import evaluate_run
+from graings.evaluation import evaluate, evaluate_run
+from graings.metrics import SplitMetrics
 from graings.training.run import TrainingRun
 
 ITERATIONS = 60
@@ -69,6 +72,28 @@ def test_training_lowers_the_held_out_error_and_writes_everything(capture: Path,
     assert len(document["curve"]) == len(points)
     assert (tmp_path / "run" / "curve.svg").read_text().lstrip().startswith(("<svg", "<?xml"))
     assert load_model(tmp_path / "run").finished
+
+
+def test_a_slow_evaluation_costs_total_time_and_no_training_time(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slowly(*arguments: Any, **options: Any) -> SplitMetrics:
+        time.sleep(0.5)
+        return evaluate(*arguments, **options)
+
+    monkeypatch.setattr("graings.training.run.evaluate", slowly)
+    list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=20)))
+    document = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    slept = 0.5 * (len(document["curve"]) + 1)  # and all of val at the end
+    assert document["phases_s"]["evaluation"] >= slept
+    assert document["train_s"] <= document["wall_s"] - slept
+    # Nobody loses a second: the clock on the wall and the phases tell the same.
+    assert document["total_s"] == pytest.approx(document["wall_s"], abs=0.1)
+    report = json.loads((tmp_path / "run" / "report" / "work_precision.json").read_text(), parse_constant=_refuse)
+    (part,) = report["training"]
+    assert part["run"]["status"] == "finished"
+    assert len(part["points"]) == len(document["curve"])
+    assert (tmp_path / "run" / "report" / "training.svg").exists()
 
 
 def _refuse(constant: str) -> float:
