@@ -1,8 +1,7 @@
 """Report: a run's numbers as strict JSON, and held-out error against run time as a drawing.
 
-The drawing is handwritten SVG without dependencies that follows the reader's light or dark theme. One line serves
-two axes: on the left the error, on the right the same number in decibels (PSNR = -20 log10 RMSE). Knows nothing of
-how numbers are made.
+One line of the drawing serves two axes: on the left the error, on the right the same number in decibels
+(PSNR = -20 log10 RMSE). Knows nothing of how numbers are made.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
+from graings.drawing import page, rule, text
 from graings.errors import CheckpointError
 
 WIDTH: Final = 960
@@ -41,32 +41,6 @@ SECONDS: Final = (
     *(2, 20, 120, 1200, 7200, 72_000, 0.2, 0.02),
 )
 DECIBELS: Final = (1, 2, 5, 10, 20)  # steps between grid lines
-
-# Colours are spelled out per theme: not every reader of SVG knows custom properties.
-STYLE: Final = """
-text { font-family: system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', 'DejaVu Sans', Arial, sans-serif;
-       font-size: 12px; fill: #6a7178; font-variant-numeric: tabular-nums; }
-.title { font-size: 17px; font-weight: 600; fill: #20252a; }
-.label { fill: #20252a; }
-.value { font-size: 13px; font-weight: 600; fill: #0d6b83; }
-.paper { fill: #fcfcfb; }
-.grid { stroke: #e6e7e5; stroke-width: 1; }
-.axis { stroke: #9aa0a6; stroke-width: 1; }
-.curve { fill: none; stroke: #0d6b83; stroke-width: 2; stroke-linejoin: round; stroke-linecap: round; }
-.point { fill: #fcfcfb; stroke: #0d6b83; stroke-width: 1.5; }
-.last { fill: #0d6b83; }
-@media (prefers-color-scheme: dark) {
-  text { fill: #9aa2aa; }
-  .title, .label { fill: #e8eaec; }
-  .value { fill: #62c6da; }
-  .paper { fill: #16191c; }
-  .grid { stroke: #2a2e33; }
-  .axis { stroke: #5b636b; }
-  .curve, .point { stroke: #62c6da; }
-  .point { fill: #16191c; }
-  .last { fill: #62c6da; }
-}
-"""
 
 
 def write_metrics(path: Path, document: Mapping[str, Any]) -> None:
@@ -127,19 +101,9 @@ def curve_svg(points: Sequence[Mapping[str, Any]]) -> str:
     Any number of points makes a picture, also none; those without a PSNR are left out.
     """
     drawn = [point for point in points if point["psnr"] is not None]
-    body = _plot(drawn) if drawn else [_text(WIDTH / 2, HEIGHT / 2, "no held-out view was evaluated", anchor="middle")]
+    body = _plot(drawn) if drawn else [text(WIDTH / 2, HEIGHT / 2, "no held-out view was evaluated", anchor="middle")]
     title = "Held-out error against run time"
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" '
-            f'height="{HEIGHT}" role="img" aria-label="{title}">',
-            f"<style>{STYLE}</style>",
-            f'<rect class="paper" width="{WIDTH}" height="{HEIGHT}" rx="8"/>',
-            _text(LEFT, 36, title, "title"),
-            *body,
-            "</svg>\n",
-        ]
-    )
+    return page(title, WIDTH, HEIGHT, [text(LEFT, 36, title, "title"), *body])
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,13 +158,13 @@ def _plot(points: Sequence[Mapping[str, Any]]) -> list[str]:
         f"{last['gaussians']:,} Gaussians from {last['anchors']:,} anchors"
     )
     parts = [
-        _text(LEFT, 58, summary),
-        _text(LEFT - 10, TOP - 16, "RMSE", "label", "end"),
-        _text(RIGHT + 10, TOP - 16, "PSNR", "label"),
+        text(LEFT, 58, summary),
+        text(LEFT - 10, TOP - 16, "RMSE", "label", "end"),
+        text(RIGHT + 10, TOP - 16, "PSNR", "label"),
     ]
     for level in levels:
-        parts.append(_text(LEFT - 10, height(level) + 4, _error(10 ** (-level / 20)), anchor="end"))
-        parts.append(_text(RIGHT + 10, height(level) + 4, f"{level} dB"))
+        parts.append(text(LEFT - 10, height(level) + 4, _error(10 ** (-level / 20)), anchor="end"))
+        parts.append(text(RIGHT + 10, height(level) + 4, f"{level} dB"))
     panels: tuple[tuple[str, str, Sequence[float], Callable[[float], str]], ...] = (
         ("train_s", "training time", SECONDS, _duration),
         ("iteration", "iterations", COUNTS, _count),
@@ -209,18 +173,18 @@ def _plot(points: Sequence[Mapping[str, Any]]) -> list[str]:
         left = LEFT + index * (PANEL + GUTTER)
         values = [float(point[key]) for point in points]
         axis = _LogAxis.over(values, left)
-        parts += [_rule(left, height(level), left + PANEL, height(level)) for level in levels]
+        parts += [rule(left, height(level), left + PANEL, height(level)) for level in levels]
         for value in axis.ticks(welcome):
-            parts.append(_rule(axis.at(value), TOP, axis.at(value), BOTTOM))
-            parts.append(_text(axis.at(value), BOTTOM + 20, name(value), anchor="middle"))
-        parts.append(_rule(left, BOTTOM, left + PANEL, BOTTOM, "axis"))
-        parts.append(_text(left + PANEL / 2, BOTTOM + 44, label, "label", "middle"))
+            parts.append(rule(axis.at(value), TOP, axis.at(value), BOTTOM))
+            parts.append(text(axis.at(value), BOTTOM + 20, name(value), anchor="middle"))
+        parts.append(rule(left, BOTTOM, left + PANEL, BOTTOM, "axis"))
+        parts.append(text(left + PANEL / 2, BOTTOM + 44, label, "label", "middle"))
         places = [(axis.at(value), height(level)) for value, level in zip(values, decibels, strict=True)]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
         parts.append(f'<polyline class="curve" points="{path}"/>')
         parts += [_mark(place, point, last=point is last) for place, point in zip(places, points, strict=True)]
         x, y = places[-1]
-        parts.append(_text(x + 4, y - 13, f"{last['psnr']:.2f} dB", "value", "end"))
+        parts.append(text(x + 4, y - 13, f"{last['psnr']:.2f} dB", "value", "end"))
     return parts
 
 
@@ -232,14 +196,6 @@ def _mark(place: tuple[float, float], point: Mapping[str, Any], *, last: bool) -
     )
     kind = "point last" if last else "point"
     return f'<circle class="{kind}" cx="{x:.1f}" cy="{y:.1f}" r="3.2"><title>{escape(words)}</title></circle>'
-
-
-def _text(x: float, y: float, text: str, kind: str = "note", anchor: str = "start") -> str:
-    return f'<text class="{kind}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
-
-
-def _rule(x1: float, y1: float, x2: float, y2: float, kind: str = "grid") -> str:
-    return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
 
 
 def _duration(seconds: float) -> str:

@@ -41,7 +41,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.encode": (),
     "graings.machine": ("graings", "graings.errors", "graings.kernel"),
     "graings.metrics": (),
-    "graings.report": ("graings.errors",),
+    "graings.drawing": (),
+    "graings.report": ("graings.drawing", "graings.errors"),
     "graings.plan": ("graings.capture.capture", "graings.config"),
     "graings.run_folder": ("graings.errors",),
     "graings.checkpoint": (
@@ -57,13 +58,27 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.evaluation", "graings.machine", "graings.metrics", "graings.plan", "graings.report"),
         *("graings.gaussians", "graings.run_folder", "graings.units", "graings.threads"),
     ),
+    # Many runs. The table and its drawing know numbers, not runs.
+    "graings.ablation": (),
+    "graings.ablation.rows": ("graings.config", "graings.errors"),
+    "graings.ablation.table": ("graings.ablation.rows",),
+    "graings.ablation.plot": ("graings.ablation.rows", "graings.ablation.table", "graings.drawing"),
+    "graings.ablation.experiment": (
+        *("graings.ablation", "graings.capture", "graings.config", "graings.errors", "graings.report"),
+        "graings.training.run",
+    ),
     # The terminal.
     "graings.progress": ("graings.training.run",),
     "graings.interrupt": (),
+    "graings.terminal": (),
+    "graings.cli_training": (
+        *("graings.ablation", "graings.config", "graings.interrupt", "graings.progress", "graings.report"),
+        *("graings.terminal", "graings.training.run"),
+    ),
     "graings.cli": (
-        *("graings.camera", "graings.checkpoint", "graings.config", "graings.encode", "graings.errors"),
-        *("graings.evaluation", "graings.interrupt", "graings.progress", "graings.render", "graings.report"),
-        *("graings.threads", "graings.training.run", "graings.viewpoint"),
+        *("graings.camera", "graings.checkpoint", "graings.cli_training", "graings.config", "graings.encode"),
+        *("graings.errors", "graings.evaluation", "graings.render", "graings.terminal", "graings.threads"),
+        "graings.viewpoint",
     ),
     "graings.__main__": ("graings.cli",),
     # Durable work knows the method by its options and its files; one child process knows how to train.
@@ -83,8 +98,11 @@ HOMES: dict[str, tuple[str, ...]] = {
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),
-    "typer": ("graings.cli", "jobs.commands", "service.commands", "service.demo"),
-    "rich": ("graings.cli", "graings.progress", "jobs.commands", "service.commands", "service.demo"),
+    "typer": ("graings.cli", "graings.cli_training", "jobs.commands", "service.commands", "service.demo"),
+    "rich": (
+        *("graings.cli", "graings.cli_training", "graings.progress", "graings.terminal", "jobs.commands"),
+        *("service.commands", "service.demo"),
+    ),
     "OpenImageIO": ("graings.capture", "graings.encode"),
     "pycolmap": ("graings.capture",),
     "lpips": ("graings.metrics",),
