@@ -76,7 +76,9 @@ def train(
 
 
 def ablate(
-    capture: Annotated[Path, typer.Argument(help="Folder of the capture; it needs validation views.")],
+    capture: Annotated[
+        Path, typer.Argument(metavar="CAPTURE", help="Folder of the capture; it needs validation views.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the runs and the table.")],
     preset: Preset = None,
     settings: Settings = None,

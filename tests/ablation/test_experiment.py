@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -193,11 +194,7 @@ def test_a_damaged_table_is_refused_with_its_remedy(capture: Path, tmp_path: Pat
 
 
 def test_a_capture_without_validation_views_is_refused_before_anything_is_run(capture: Path, tmp_path: Path) -> None:
-    blind = tmp_path / "blind"
-    blind.mkdir()
-    for path in capture.iterdir():
-        if "val" not in path.name:
-            (blind / path.name).symlink_to(path)
+    blind = shutil.copytree(capture, tmp_path / "blind", ignore=shutil.ignore_patterns("*val*"))
     with pytest.raises(CaptureError, match="validation"):
         ablation(tmp_path / "out", blind)
     assert not (tmp_path / "out").exists()
@@ -221,7 +218,7 @@ def test_the_command_line_takes_lists_and_tells_the_differences(
     [
         (["--rows", "full", "no_such"], 2, "no_such"),
         (["--set", "scene.residual=false"], 2, "scene.residual"),
-        (["--seeds", "-1"], 2, "-1"),
+        (["--seeds", "-1"], 2, "--seeds"),
         (["--set", "seed=3"], 2, "--seeds"),
     ],
 )
