@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from graings.capture.synthetic import write_synthetic
 from graings.checkpoint import load_model
 from graings.cli import main
 from graings.errors import CaptureError, CheckpointError, ConfigError
+from graings.progress import TrainingProgress
 
 SETTINGS = {
     "iterations": 6,
@@ -54,6 +57,14 @@ def folder(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pair = ablation(where, capture, rows=("full", "no_l_def"), seeds=(0, 3))
     assert carry_out(pair) == ["full/seed-3", "no_l_def/seed-3"]
     return where
+
+
+def graings(*arguments: object) -> int:
+    """The exit code of a command line."""
+    with pytest.raises(SystemExit) as exit_:
+        main([str(argument) for argument in arguments])
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
 
 
 def table(folder: Path) -> dict[str, Any]:
@@ -205,12 +216,25 @@ def test_the_command_line_takes_lists_and_tells_the_differences(
 ) -> None:
     sets = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
     command = ["ablate", "--rows", "full", "no_l_def", "--seeds", "0", "3", "--preset", "draft", *sets]
-    with pytest.raises(SystemExit) as exit_:
-        main([*command, "-o", str(folder), str(capture)])
-    assert exit_.value.code == 0
+    assert graings(*command, "-o", folder, capture) == 0
     said = capsys.readouterr().out
     assert "4 runs, 4 of them finished" in said
     assert "ablation.md" in said
+
+
+def test_ctrl_c_ends_the_command_with_a_checkpoint_and_the_same_command_goes_on(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sets = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
+    command = ["ablate", str(capture), "-o", str(tmp_path / "out"), "--preset", "draft", *sets]
+    command += ["--rows", "full", "no_l_res", "--seeds", "2"]
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingProgress, "show", lambda progress, step: os.kill(os.getpid(), signal.SIGINT))
+        assert graings(*command) == 128 + signal.SIGINT
+    assert "2 runs left" in capsys.readouterr().out
+    assert load_model(tmp_path / "out" / "full" / "seed-2").iteration == 1
+    assert graings(*command) == 0
+    assert [row["finished"] for row in table(tmp_path / "out")["rows"]] == [1, 1]
 
 
 @pytest.mark.parametrize(
@@ -225,8 +249,6 @@ def test_the_command_line_takes_lists_and_tells_the_differences(
 def test_a_mistake_is_one_clear_message_and_leaves_nothing_behind(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, word: str
 ) -> None:
-    with pytest.raises(SystemExit) as exit_:
-        main(["ablate", str(capture), "-o", str(tmp_path / "out"), *arguments])
-    assert exit_.value.code == code
+    assert graings("ablate", capture, "-o", tmp_path / "out", *arguments) == code
     assert word in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
