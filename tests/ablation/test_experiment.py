@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -16,24 +14,10 @@ from graings.ablation.experiment import Ablation
 from graings.ablation.rows import ROWS
 from graings.capture.synthetic import write_synthetic
 from graings.checkpoint import load_model
-from graings.cli import main
 from graings.errors import CaptureError, CheckpointError, ConfigError
-from graings.progress import TrainingProgress
+from tests.ablation.tiny import SETTINGS, table
 
-SETTINGS = {
-    "iterations": 6,
-    "init.points": 300,
-    "scene.children": 2,
-    "scene.deform_width": 8,
-    "scene.deform_depth": 1,
-    "evaluation.first": 3,
-}
 NAMES = [row.name for row in ROWS]
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_synthetic(tmp_path_factory.mktemp("capture") / "tiny", seed=1, frames=12, size=32, bodies=2)
 
 
 def ablation(folder: Path, capture: Path, **options: Any) -> Ablation:
@@ -57,21 +41,6 @@ def folder(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pair = ablation(where, capture, rows=("full", "no_l_def"), seeds=(0, 3))
     assert carry_out(pair) == ["full/seed-3", "no_l_def/seed-3"]
     return where
-
-
-def graings(*arguments: object) -> int:
-    """The exit code of a command line."""
-    with pytest.raises(SystemExit) as exit_:
-        main([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
-
-
-def table(folder: Path) -> dict[str, Any]:
-    document = json.loads((folder / "ablation.json").read_text(), parse_constant=lambda word: pytest.fail(word))
-    assert document["schema"] == "graings.ablation/1"
-    assert isinstance(document, dict)
-    return document
 
 
 def everything_in(folder: Path) -> dict[str, bytes]:
@@ -208,47 +177,4 @@ def test_a_capture_without_validation_views_is_refused_before_anything_is_run(ca
     blind = shutil.copytree(capture, tmp_path / "blind", ignore=shutil.ignore_patterns("*val*"))
     with pytest.raises(CaptureError, match="validation"):
         ablation(tmp_path / "out", blind)
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_command_line_takes_lists_and_tells_the_differences(
-    folder: Path, capture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    sets = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
-    command = ["ablate", "--rows", "full", "no_l_def", "--seeds", "0", "3", "--preset", "draft", *sets]
-    assert graings(*command, "-o", folder, capture) == 0
-    said = capsys.readouterr().out
-    assert "4 runs, 4 of them finished" in said
-    assert "ablation.md" in said
-
-
-def test_ctrl_c_ends_the_command_with_a_checkpoint_and_the_same_command_goes_on(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sets = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
-    command = ["ablate", str(capture), "-o", str(tmp_path / "out"), "--preset", "draft", *sets]
-    command += ["--rows", "full", "no_l_res", "--seeds", "2"]
-    with monkeypatch.context() as patch:
-        patch.setattr(TrainingProgress, "show", lambda progress, step: os.kill(os.getpid(), signal.SIGINT))
-        assert graings(*command) == 128 + signal.SIGINT
-    assert "2 runs left" in capsys.readouterr().out
-    assert load_model(tmp_path / "out" / "full" / "seed-2").iteration == 1
-    assert graings(*command) == 0
-    assert [row["finished"] for row in table(tmp_path / "out")["rows"]] == [1, 1]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "word"),
-    [
-        (["--rows", "full", "no_such"], 2, "no_such"),
-        (["--set", "scene.residual=false"], 2, "scene.residual"),
-        (["--seeds", "-1"], 2, "--seeds"),
-        (["--set", "seed=3"], 2, "--seeds"),
-    ],
-)
-def test_a_mistake_is_one_clear_message_and_leaves_nothing_behind(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, word: str
-) -> None:
-    assert graings("ablate", capture, "-o", tmp_path / "out", *arguments) == code
-    assert word in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
