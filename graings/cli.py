@@ -1,8 +1,8 @@
 """The command line: one verb per thing a person wants done.
 
-Reads arguments, calls the library, prints, and turns errors into one line and an exit code. Verbs that need jobs
-or HTTP live in those packages and join through the entry-point group `graings.commands`; this module does not
-know their names.
+Reads arguments, calls the library, prints, and turns errors into one line and an exit code. The verbs that train are in
+`graings.cli_training`. Verbs that need jobs or HTTP live in those packages and join through the entry-point group
+`graings.commands`; this module does not know their names.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NoReturn
@@ -24,17 +24,15 @@ from rich.text import Text
 
 from graings.camera import Camera
 from graings.checkpoint import Model, load_model
-from graings.config import PRESETS, Part, make_config, options
+from graings.cli_training import Lists, Threads, ablate, train
+from graings.config import Part, make_config, options
 from graings.encode import encode_image, image_format
 from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
 from graings.evaluation import evaluate_run
-from graings.interrupt import Interrupt
-from graings.progress import TrainingProgress
 from graings.render import render
-from graings.report import read_metrics
 from graings.report_folder import report_runs
+from graings.terminal import metrics_line, say
 from graings.threads import use_threads
-from graings.training.run import TrainingRun
 from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
 from graings.work_precision import summary
 
@@ -53,7 +51,6 @@ EPILOG: Final = (
     "SIGTERM), for training with a checkpoint to resume from."
 )
 
-Threads = Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads; left out: all cores.")]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or one of its checkpoints.")]
 
 
@@ -79,54 +76,8 @@ def graings() -> None:
     """See a moving scene from anywhere, at any time, with nothing but a CPU."""
 
 
-@app.command()
-def train(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="RUN", help="Folder of the run.")],
-    capture: Annotated[Path | None, typer.Argument(help="Folder of the capture; optional with --resume.")] = None,
-    preset: Annotated[str | None, typer.Option(help=f"Where defaults come from: {', '.join(PRESETS)}.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any option of `graings options`.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue RUN from its newest checkpoint.")] = False,
-    threads: Threads = None,
-) -> None:
-    """Train a model on a capture."""
-    if resume:
-        if preset is not None or settings:
-            raise typer.BadParameter("a resumed run keeps its options; leave out --preset and --set")
-        run = TrainingRun.resume(output, capture=capture, threads=threads)
-    else:
-        if capture is None:
-            raise typer.BadParameter("say which capture to train on", param_hint="CAPTURE")
-        overrides = dict(_setting(text) for text in settings or ())
-        if preset is not None:
-            overrides["preset"] = preset
-        if threads is not None:
-            overrides["threads"] = threads
-        run = TrainingRun.create(capture, output, make_config(overrides=overrides))
-    _train(run)
-
-
-def _train(run: TrainingRun) -> None:
-    with (
-        TrainingProgress(Console(), run.iteration, run.iterations) as progress,
-        Interrupt(lambda: progress.note("stopping after this step; once more to stop at once")) as interrupt,
-    ):
-        for note in run.capture.notes:
-            progress.note(note)
-        for step in run:
-            progress.show(step)
-            if interrupt.received is not None and step.iteration < run.iterations:
-                run.save()
-                break
-    if run.iteration < run.iterations:
-        _say(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations; nothing is lost.")
-        _say(f"Continue with: graings train --resume -o {run.folder}")
-        raise typer.Exit(interrupt.exit_code)
-    for split, metrics in read_metrics(run.metrics_path)["splits"].items():
-        _say_metrics(split, metrics)
-    _say(f"The model, metrics.json, curve.svg and report/ are in {run.folder}.")
-    _say(f"Look at it: graings render {run.folder} --t 0.5 -o view.png")
+app.command()(train)
+app.command(cls=Lists)(ablate)
 
 
 @app.command(name="render")
@@ -177,12 +128,12 @@ def render_view(
         raise typer.BadParameter(str(error)) from error
     moment = own_time if t is None else min(max(t, 0.0), 1.0)
     if t is not None and moment != t:
-        _say(f"Time {t:g} lies outside the capture; drawn at {moment:g}.")
+        say(f"Time {t:g} lies outside the capture; drawn at {moment:g}.")
     started = time.perf_counter()
     result = render(model.scene, view, moment, rgb or model.background)
     milliseconds = 1e3 * (time.perf_counter() - started)
     output.write_bytes(encode_image(result.color.numpy(), format))
-    _say(f"{output}: {view.width} x {view.height} at t = {moment:g}, drawn in {milliseconds:.0f} ms.")
+    say(f"{output}: {view.width} x {view.height} at t = {moment:g}, drawn in {milliseconds:.0f} ms.")
 
 
 @app.command()
@@ -194,8 +145,8 @@ def evaluate(
 ) -> None:
     """Measure a trained model on held-out views and add the numbers to its metrics.json."""
     use_threads(threads)
-    _say_metrics(split, evaluate_run(run, split, capture).to_json())
-    _say(f"Written to {run / 'metrics.json'}.")
+    say(metrics_line(split, evaluate_run(run, split, capture).to_json()))
+    say(f"Written to {run / 'metrics.json'}.")
 
 
 @app.command()
@@ -214,12 +165,12 @@ def report(
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="RUN") from error
     for part in written.document["training"]:
-        _say(summary(part))
+        say(summary(part))
         for problem in part["phases"]["problems"]:
-            _say(f"{part['run']['name']}: {problem}")
+            say(f"{part['run']['name']}: {problem}")
     for note in written.notes:
-        _say(note)
-    _say(f"Written to {written.folder}: {', '.join(written.files)}.")
+        say(note)
+    say(f"Written to {written.folder}: {', '.join(written.files)}.")
 
 
 @app.command(name="options")
@@ -262,17 +213,6 @@ def _joined(entry: EntryPoint) -> Any:
     return typer.main.get_command(one)
 
 
-def _setting(text: str) -> tuple[str, Any]:
-    """`key=value` with the value as JSON, or as a string where it is none."""
-    key, equals, value = text.partition("=")
-    if not equals or not key:
-        raise typer.BadParameter(f"must look like key=value, got {text!r}", param_hint="--set")
-    try:
-        return key, json.loads(value)
-    except ValueError:
-        return key, value
-
-
 def _read_pose(file: Path, model: Model) -> Camera:
     """The camera in a pose file; `ValueError` naming the key that is missing or wrong."""
     try:
@@ -299,20 +239,6 @@ def _fields(part: Part, prefix: str = "") -> Iterator[tuple[str, str, str, str]]
         signs = (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<"))
         bounds = [f"{sign} {getattr(m, key)}" for m in field.metadata for key, sign in signs if hasattr(m, key)]
         yield f"{prefix}{name}", json.dumps(value), ", ".join(bounds), field.description or ""
-
-
-def _say_metrics(split: str, metrics: Mapping[str, Any]) -> None:
-    if metrics["psnr"] is None:
-        _say(f"{split}: {metrics['reason']}")
-        return
-    lpips = metrics["lpips_vgg"]
-    rest = f"LPIPS {lpips:.4f}" if lpips is not None else f"no LPIPS: {metrics['lpips_reason']}"
-    views = len(metrics["views"])
-    _say(f"{split}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim_3dgs']:.4f}, {views} views; {rest}")
-
-
-def _say(text: str) -> None:
-    Console().print(Text(text), soft_wrap=True)
 
 
 def _fail(text: str, code: int) -> NoReturn:

@@ -72,14 +72,27 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.gaussians", "graings.run_folder", "graings.units", "graings.threads"),
         *("graings.report_folder", "graings.work_precision"),
     ),
+    # Many runs. The table and its drawing know numbers, not runs.
+    "graings.ablation": (),
+    "graings.ablation.rows": ("graings.config", "graings.errors"),
+    "graings.ablation.table": ("graings.ablation.rows",),
+    "graings.ablation.plot": ("graings.ablation.rows", "graings.ablation.table", "graings.drawing"),
+    "graings.ablation.experiment": (
+        *("graings.ablation", "graings.capture", "graings.config", "graings.errors", "graings.report"),
+        "graings.training.run",
+    ),
     # The terminal.
     "graings.progress": ("graings.training.run",),
     "graings.interrupt": (),
+    "graings.terminal": (),
+    "graings.cli_training": (
+        *("graings.ablation", "graings.config", "graings.interrupt", "graings.progress", "graings.report"),
+        *("graings.terminal", "graings.training.run"),
+    ),
     "graings.cli": (
-        *("graings.camera", "graings.checkpoint", "graings.config", "graings.encode", "graings.errors"),
-        *("graings.evaluation", "graings.interrupt", "graings.progress", "graings.render", "graings.report"),
-        *("graings.report_folder", "graings.threads", "graings.training.run", "graings.viewpoint"),
-        "graings.work_precision",
+        *("graings.camera", "graings.checkpoint", "graings.cli_training", "graings.config", "graings.encode"),
+        *("graings.errors", "graings.evaluation", "graings.render", "graings.report_folder", "graings.terminal"),
+        *("graings.threads", "graings.viewpoint", "graings.work_precision"),
     ),
     "graings.__main__": ("graings.cli",),
     # Durable work knows the method by its options and its files; one child process knows how to train.
@@ -101,8 +114,11 @@ HOMES: dict[str, tuple[str, ...]] = {
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),
-    "typer": ("graings.cli", "jobs.commands", "service.commands", "service.demo"),
-    "rich": ("graings.cli", "graings.progress", "jobs.commands", "service.commands", "service.demo"),
+    "typer": ("graings.cli", "graings.cli_training", "jobs.commands", "service.commands", "service.demo"),
+    "rich": (
+        *("graings.cli", "graings.cli_training", "graings.progress", "graings.terminal", "jobs.commands"),
+        *("service.commands", "service.demo"),
+    ),
     "OpenImageIO": ("graings.capture", "graings.encode"),
     "pycolmap": ("graings.capture",),
     "lpips": ("graings.metrics",),

@@ -1,0 +1,169 @@
+"""Rows: the models an ablation compares, what each changes, and what the paper measured for it.
+
+A row is the method with one decision taken back. Every row states all switches, so that two rows of one experiment
+differ in what their names say and in nothing else. Knows nothing of runs, folders or tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from graings.config import Part, TrainConfig, make_config
+from graings.errors import ConfigError
+
+# The switches as the method sets them.
+METHOD: Final[Mapping[str, Any]] = {
+    "scene.stop_gradient": True,
+    "scene.deformation": "child",
+    "scene.single_mlp": False,
+    "scene.residual": True,
+    "scene.canonical": True,
+    "loss.l_temp": True,
+    "loss.l_def": True,
+    "loss.l_res": True,
+}
+
+FULL: Final = "full"
+SCENES: Final = "mean over the eight D-NeRF scenes, 30 000 iterations"
+
+
+@dataclass(frozen=True, slots=True)
+class PaperResult:
+    """What the paper prints for a row: PSNR in dB, SSIM and LPIPS of the mean over D-NeRF, and in which table."""
+
+    psnr: float
+    ssim: float
+    lpips: float
+    table: str
+
+    @property
+    def difference(self) -> float:
+        """PSNR above the paper's full model, dB (negative where the row is worse)."""
+        return round(self.psnr - PAPER_FULL.psnr, 3)
+
+
+PAPER_FULL: Final = PaperResult(36.982, 0.9871, 0.0136, "ablation_stopgrad")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One model of the comparison.
+
+    `changes` are the switches it takes back, by dotted option name; `needs` are weights that must not be zero for the
+    row to differ from the full model at all; `paper` is None where the paper has no number.
+    """
+
+    name: str
+    label: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
+    paper: PaperResult | None = None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Every switch with the value that this row demands."""
+        return {**METHOD, **self.changes}
+
+
+ROWS: Final[tuple[Row, ...]] = (
+    Row(FULL, "full", paper=PAPER_FULL),
+    Row(
+        "no_stop_gradient",
+        "without stop-gradient",
+        {"scene.stop_gradient": False},
+        paper=PaperResult(35.643, 0.9812, 0.0253, "ablation_stopgrad"),
+    ),
+    Row(
+        "no_l_temp",
+        "without L_temp",
+        {"loss.l_temp": False},
+        needs=("loss.temporal", "loss.gain"),
+        paper=PaperResult(36.214, 0.9829, 0.0167, "ablation_loss"),
+    ),
+    Row(
+        "no_l_def",
+        "without L_def",
+        {"loss.l_def": False},
+        needs=("loss.deformation", "loss.gain"),
+        paper=PaperResult(36.461, 0.9856, 0.0154, "ablation_loss"),
+    ),
+    Row(
+        "no_l_res",
+        "without L_res",
+        {"loss.l_res": False},
+        needs=("loss.residual", "loss.gain", "scene.residual_scale"),
+        paper=PaperResult(36.647, 0.9861, 0.0148, "ablation_loss"),
+    ),
+    Row(
+        "single_mlp",
+        "single MLP",
+        {"scene.single_mlp": True},
+        paper=PaperResult(36.201, 0.9836, 0.0198, "ablation"),
+    ),
+    Row(
+        "no_residual",
+        "without residual",
+        {"scene.residual": False},
+        needs=("scene.residual_scale",),
+        paper=PaperResult(36.512, 0.9854, 0.0162, "ablation"),
+    ),
+    Row(
+        "no_canonical",
+        "without canonical",
+        {"scene.canonical": False},
+        paper=PaperResult(35.834, 0.9812, 0.0221, "ablation"),
+    ),
+    Row("anchor_deformation", "deformation per anchor", {"scene.deformation": "anchor"}),
+)
+
+
+def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
+    """The rows of these names, each once, in the order of `ROWS`; all of them for no names.
+
+    Raises `ConfigError` naming a row that does not exist.
+    """
+    known = [row.name for row in ROWS]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ConfigError(f"rows: there is no row {unknown[0]!r}. Choose from {', '.join(known)}.")
+    return tuple(row for row in ROWS if not names or row.name in names)
+
+
+def row_config(row: Row, preset: str, settings: Mapping[str, Any], seed: int) -> TrainConfig:
+    """The options of one run: `preset`, then the user's `settings` (dotted or nested), then what `row` demands.
+
+    Raises `ConfigError` for settings that contradict the row, or that leave it no different from the full model.
+    """
+    asked = make_config(preset, dict(settings))
+    if "seed" in asked.model_fields_set:
+        raise ConfigError("seed: an ablation gives every row the same seeds. Leave it out and use --seeds.")
+    for key, wanted in row.options.items():
+        value, by_user = _option(asked, key)
+        if by_user and value != wanted:
+            raise ConfigError(
+                f"{key}: is set to {value!r}, but the row {row.name} is {wanted!r} there. "
+                "Leave the setting out, or name the rows that agree with it (--rows)."
+            )
+    for key in row.needs:
+        if not _option(asked, key)[0]:
+            raise ConfigError(
+                f"{key}: is 0, so the row {row.name} would be the full model over again. "
+                "Give it a weight, or leave the row out (--rows)."
+            )
+    return combined(row, preset, settings, seed)
+
+
+def combined(row: Row, preset: str, settings: Mapping[str, Any], seed: int) -> TrainConfig:
+    """As `row_config`, without asking whether the settings suit the row."""
+    return make_config(preset, {**settings, **row.options, "seed": seed})
+
+
+def _option(config: TrainConfig, key: str) -> tuple[Any, bool]:
+    """Value of a dotted option, and whether it was given rather than left at its default."""
+    *parts, name = key.split(".")
+    owner: Part = config
+    for part in parts:
+        owner = getattr(owner, part)
+    return getattr(owner, name), name in owner.model_fields_set

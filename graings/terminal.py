@@ -1,0 +1,27 @@
+"""Terminal: lines for a person to read.
+
+Knows nothing of arguments, exit codes or progress bars.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+
+def say(words: str) -> None:
+    """Print a line as it is: no markup, no wrapping."""
+    Console().print(Text(words), soft_wrap=True)
+
+
+def metrics_line(split: str, metrics: Mapping[str, Any]) -> str:
+    """The means of a split as one line; `metrics` is one of the splits of a metrics document."""
+    if metrics["psnr"] is None:
+        return f"{split}: {metrics['reason']}"
+    lpips = metrics["lpips_vgg"]
+    rest = f"LPIPS {lpips:.4f}" if lpips is not None else f"no LPIPS: {metrics['lpips_reason']}"
+    views = len(metrics["views"])
+    return f"{split}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim_3dgs']:.4f}, {views} views; {rest}"
