@@ -1,0 +1,67 @@
+"""Collapse: nothing of the scene is drawn any more, and what is not drawn gets no gradient to come back.
+
+Where the opacity of all children has fallen to one grey level or below, training would stand still for good. It is
+noticed after one pass over the training views, and mended once, in the open. Knows nothing of views or losses.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from graings.scene.scene import Scene
+
+# Below this share of the children in every view of a pass the scene has collapsed.
+LEAST_SHOWN: Final = 1e-3
+
+# The score that the median child is given again: what children are born with.
+SCORE: Final = 0.1
+
+
+class Collapse:
+    """The largest share of children drawn in a view of the current pass, and whether it was mended before."""
+
+    def __init__(self) -> None:
+        self.mended = False
+        self._shown = 0.0
+
+    def observe(self, drawn: int, slots: int, *, last_of_pass: bool) -> bool:
+        """Record a view that drew `drawn` of `slots` children; True when the scene has collapsed and may be mended."""
+        self._shown = max(self._shown, drawn / max(slots, 1))
+        if not last_of_pass:
+            return False
+        collapsed, self._shown = self._shown < LEAST_SHOWN, 0.0
+        return collapsed and not self.mended
+
+    def state(self) -> dict[str, Any]:
+        """Plain numbers to go on from."""
+        return {"mended": self.mended, "shown": self._shown}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Continue from what `state()` gave."""
+        self.mended, self._shown = bool(state["mended"]), float(state["shown"])
+
+
+def mean_logits(scene: Scene) -> Float[Tensor, "anchor child"]:
+    """Opacity logits of every slot as no particular camera sees it.
+
+    The mean direction stands for all views where opacity looks at it.
+    """
+    with torch.no_grad():
+        still = torch.zeros_like(scene.scaffold.anchors)
+        logits = scene.appearance.opacity_logits(scene.scaffold.features, still)
+        return logits + scene.scaffold.opacity_offsets.unsqueeze(-1)
+
+
+def mend(scene: Scene) -> float:
+    """Shift the last bias of the opacity head so that the median score is `SCORE`; returns the shift."""
+    shift = math.atanh(SCORE) - float(mean_logits(scene).median())
+    last = scene.appearance.opacity[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        last.bias.add_(shift)
+    return shift
