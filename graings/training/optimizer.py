@@ -90,20 +90,20 @@ class Optimizer:
     def limit(self, group: str, times: float, norm: float) -> None:
         """Limit the gradients of `group`: no entry above `times` its own usual size, and all together at most `norm`.
 
-        The usual size is the root of Adam's second moment; an entry without one is limited with its group only. A
-        single spike thus neither freezes its own parameter nor takes the rest of the group down with it.
+        The usual size is the root of Adam's second moment as it is stored, so that `times` = 100 lets the moment grow
+        11-fold and the following steps shrink to 30 %, however young the moment is. An entry without one is limited
+        with its group only. A single spike thus neither freezes its own parameter nor takes its group down with it.
         """
         members = next(members for members in self.adam.param_groups if members["name"] == group)
-        _, beta = members["betas"]
         gradients: list[Tensor] = []
         for parameter in members["params"]:
             if parameter.grad is None:
                 continue
             state = self.adam.state.get(parameter)
             if state:
-                usual = (state["exp_avg_sq"] / (1.0 - beta ** float(state["step"]))).sqrt_().mul_(times)
-                usual.masked_fill_(usual == 0, math.inf)
-                parameter.grad.clamp_(min=-usual, max=usual)
+                most = state["exp_avg_sq"].sqrt().mul_(times)
+                most.masked_fill_(most == 0, math.inf)
+                parameter.grad.clamp_(min=-most, max=most)
             gradients.append(parameter.grad)
         left = math.hypot(*(float(torch.linalg.vector_norm(gradient.double())) for gradient in gradients))
         if left > norm:
