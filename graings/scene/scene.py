@@ -76,9 +76,7 @@ class Scene(nn.Module):
         moment = torch.tensor([time], dtype=dtype)
         directions = self.directions(eye)
 
-        scores = tanh(
-            self.appearance.opacity_logits(features, directions) + scaffold.opacity_offsets.unsqueeze(-1)
-        )
+        scores = tanh(self.appearance.opacity_logits(features, directions) + scaffold.opacity_offsets.unsqueeze(-1))
         change: Tensor | None = None
         residual = self.residual if self.temporal else None
         if residual is not None:

@@ -6,15 +6,17 @@ import sys
 from pathlib import Path
 
 from graings.capture.synthetic import write_synthetic
+from graings.checkpoint import load_model
 from graings.config import make_config
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
+from jobs.progress import last_progress, read_progress
 from jobs.store import JobFolder, Store
 
 
-def job(store: Store) -> JobFolder:
+def job(store: Store, options: dict[str, object] | None = None) -> JobFolder:
     unpacked = write_synthetic(store.uploads / "u", frames=6, size=24)
-    config = make_config("draft", {"iterations": 100_000, "init.points": 300}).model_dump(mode="json")
+    config = make_config("draft", {"iterations": 100_000, "init.points": 300, **(options or {})}).model_dump(mode="json")
     return store.folder(store.create(JobSpec(name="job", capture="0" * 64, config=config), unpacked))
 
 
@@ -33,3 +35,25 @@ def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_p
         assert process.wait(60) == ExitCode.REFUSED
     assert "train/r_" in json.loads(said)["error"]
     assert folder.checkpoint() is None
+
+
+def test_a_training_that_comes_apart_ends_diverged_with_a_model_and_a_last_report(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    # A rate that grows out of all bounds: the first steps are sound, a few dozen later the numbers run out.
+    blow_up = {"iterations": 200, "evaluation.first": 2, "rates.offsets": [0.02, 1e30], "rates.features": [0.01, 1e30]}
+    folder = job(store, blow_up | {"guard.check_every": 5, "guard.patience": 10})
+    with trainer(folder) as process:
+        assert process.stdout is not None
+        said = process.stdout.read()
+        assert process.wait(60) == ExitCode.DIVERGED
+    assert "diverged" in json.loads(said)["error"]
+    model = load_model(folder.run)
+    assert folder.checkpoint() == model.iteration
+    assert all(bool(values.isfinite().all()) for values in model.scene.state_dict().values())
+    assert json.loads(folder.metrics.read_text())["diverged"]
+    last = last_progress(folder.progress)
+    assert last is not None
+    assert (last["phase"], last["iteration"]) == ("diverged", model.iteration)
+    reports, _ = read_progress(folder.progress, 0)
+    events = [event for _, report in reports for event in report.get("events", [])]
+    assert sum(event.startswith("rolled back") for event in events) == 3

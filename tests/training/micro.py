@@ -69,7 +69,9 @@ def finite(trainer: Trainer) -> bool:
     return all(bool(tensor.isfinite().all()) for tensor in tensors)
 
 
-def spoil_gradient(trainer: Trainer, name: str, when: Callable[[int], bool], change: Callable[[Tensor], Tensor]) -> None:
+def spoil_gradient(
+    trainer: Trainer, name: str, when: Callable[[int], bool], change: Callable[[Tensor], Tensor]
+) -> None:
     """Have `change` make the gradient of parameter `name` in the steps that `when` chooses."""
     parameter = dict(trainer.scene.named_parameters())[name]
     parameter.register_hook(lambda gradient: change(gradient.clone()) if when(trainer.iteration) else gradient)

@@ -100,11 +100,11 @@ def test_a_diverged_run_can_be_resumed_at_its_low_rates_and_finish(
     micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "run"
-    _lost(micro, folder, monkeypatch, iterations=80)
+    _lost(micro, folder, monkeypatch, iterations=90)
     monkeypatch.undo()
     again = TrainingRun.resume(folder, threads=1)
     assert again._trainer.optimizer.damping == 0.125
-    assert list(again)[-1].iteration == 80
+    assert list(again)[-1].iteration == 90
     document = _document(folder)
     assert (document["diverged"], document["rollbacks"], document["skipped_steps"]) == (False, 3, 12)
     assert load_model(folder).finished

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from graings.capture.synthetic import write_synthetic
+from graings.config import make_config
 from graings.errors import CaptureError
 from graings.training.run import TrainingRun
 from tests.capture.captures import entry, orbit, write_image, write_transforms
@@ -29,7 +31,7 @@ def _scaled(capture: Path, folder: Path, factor: float) -> Path:
             for row in range(3):
                 frame["transform_matrix"][row][3] *= factor
         (folder / f"transforms_{split}.json").write_text(json.dumps(facts))
-        (folder / split).symlink_to(capture / split)
+        shutil.copytree(capture / split, folder / split)
     return folder
 
 
@@ -106,18 +108,20 @@ def test_one_camera_that_sees_many_times_trains(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "color"), [("grey", (0.5,) * 3), ("black", (0.0,) * 3), ("white", (1.0,) * 3)])
-def test_images_of_one_constant_colour_are_learned_without_growing(
+def test_images_of_one_constant_colour_are_learned_and_hardly_grow(
     tmp_path: Path, name: str, color: tuple[float, ...]
 ) -> None:
     """D03: on a white background, so that white is empty space."""
-    growing = {"density.statistics_from": 0, "density.grow_from": 2_000, "density.grow_until": 20_000}
+    drafted = make_config("draft").density.model_dump()
+    growing = {f"density.{name}": value for name, value in drafted.items()}
     trainer = micro_trainer(_painted(tmp_path / name, lambda _: color), iterations=300, **growing)
     start = trainer.scene.scaffold.count
     reports = steps(trainer, 150)
     assert finite(trainer)
-    assert reports[-1].loss < 0.5 * reports[0].loss
+    assert reports[-1].loss < 1e-2
     assert trainer.guard.rollbacks == 0
-    assert trainer.scene.scaffold.count <= max(1.1 * start, start + 1)
+    # Black and white do not grow; grey ends at the border of the pictures, where no view agrees with another.
+    assert trainer.scene.scaffold.count <= 1.2 * start
 
 
 def test_alpha_that_is_zero_everywhere_is_refused(tmp_path: Path) -> None:
