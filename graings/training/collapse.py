@@ -1,7 +1,8 @@
 """Collapse: nothing of the scene is drawn any more, and what is not drawn gets no gradient to come back.
 
 Where the opacity of all children has fallen to one grey level or below, training would stand still for good. It is
-noticed after one pass over the training views, and mended once, in the open. Knows nothing of views or losses.
+noticed after one pass over the training views and mended once, in the open; a second time the rates are to blame.
+Knows nothing of views or losses.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ class Collapse:
         self._shown = 0.0
 
     def observe(self, drawn: int, slots: int, *, last_of_pass: bool) -> bool:
-        """Record a view that drew `drawn` of `slots` children; True when the scene has collapsed and may be mended."""
+        """Record a view that drew `drawn` of `slots` children; True when the pass it ends has shown a collapse."""
         self._shown = max(self._shown, drawn / max(slots, 1))
         if not last_of_pass:
             return False
         collapsed, self._shown = self._shown < LEAST_SHOWN, 0.0
-        return collapsed and not self.mended
+        return collapsed
 
     def state(self) -> dict[str, Any]:
         """Plain numbers to go on from."""

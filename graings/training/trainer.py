@@ -235,12 +235,15 @@ class Trainer:
         """Look after the scene's health and go back where it is lost; returns what happened, in words."""
         events: list[str] = []
         scaffold, every = self.scene.scaffold, self.config.guard
+        problem = self.guard.problem()
         last_of_pass = len(self.sampler.remaining) == 0
         if self.collapse.observe(drawn, scaffold.count * scaffold.slots, last_of_pass=last_of_pass):
-            shift = mend(self.scene)
-            self.collapse.mended = True
-            events.append(f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g})")
-        problem = self.guard.problem()
+            if not self.collapse.mended:
+                shift = mend(self.scene)
+                self.collapse.mended = True
+                events.append(f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g})")
+            elif problem is None and not self.guard.trend.small:
+                problem = "nothing was drawn any more, though there was something to see"
         due = self.iteration % every.snapshot_every == 0
         if problem is None and (due or self.iteration % every.check_every == 0):
             problem = self._lost()
@@ -274,12 +277,13 @@ class Trainer:
                 f"Training diverged at iteration {self.iteration} after going back {self.guard.rollbacks} times: "
                 f"{problem}. The best model is kept. Train again with smaller rates (`rates`)."
             )
-        iteration, before = self.iteration, self.guard
+        iteration, before, mended = self.iteration, self.guard, self.collapse.mended
         snapshot = self.snapshots.back()
         self.load(copy.deepcopy(snapshot.scene), snapshot.tensors, snapshot.facts)
         self.iteration = iteration
         self.guard.rolled_back(before)
         self.guard.rollbacks += 1
+        self.collapse.mended = mended
         self._slow_down()
         self.sampler = self._sampler()
         return (

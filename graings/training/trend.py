@@ -28,14 +28,18 @@ class Trend:
         self.mean: float | None = None
         self.best = 0.0
         self.above = 0
+        self._count = 0
         self._settling = 0
 
     def add(self, loss: float) -> None:
         """One more finite loss."""
         if self.mean is None:
             self.mean = self.best = loss
-        self.mean += NEWEST * (loss - self.mean)
-        self.best = min(self.best, self.mean)
+        # A plain mean at first: the very first losses would otherwise weigh on it for a hundred steps.
+        self._count += 1
+        self.mean += max(NEWEST, 1.0 / self._count) * (loss - self.mean)
+        # Few views are no mean yet: an easy one at the start would make all others look like a relapse.
+        self.best = self.mean if self._count * NEWEST < 1 else min(self.best, self.mean)
         if self.mean <= self._limit():
             self.above = 0
         elif self._settling == 0:
@@ -51,6 +55,11 @@ class Trend:
         """Whether the mean is near the best, so that the moment is worth coming back to."""
         return self.mean is None or self.mean <= self._limit()
 
+    @property
+    def small(self) -> bool:
+        """Whether the mean is so small that a picture of nothing but background is about right."""
+        return self.mean is None or self.mean <= MARGIN
+
     def problem(self) -> str | None:
         """Why the run has come apart, or None."""
         if self.above < self._config.patience:
@@ -59,12 +68,18 @@ class Trend:
 
     def state(self) -> dict[str, Any]:
         """Plain numbers to go on from."""
-        return {"mean": self.mean, "best": self.best, "above": self.above, "settling": self._settling}
+        return {
+            "mean": self.mean,
+            "best": self.best,
+            "above": self.above,
+            "count": self._count,
+            "settling": self._settling,
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from what `state()` gave."""
         self.mean, self.best, self.above = state["mean"], state["best"], state["above"]
-        self._settling = state["settling"]
+        self._count, self._settling = state["count"], state["settling"]
 
     def _limit(self) -> float:
         return max(self._config.excess * self.best, self.best + MARGIN)

@@ -16,7 +16,9 @@ from jobs.store import JobFolder, Store
 
 def job(store: Store, options: dict[str, object] | None = None) -> JobFolder:
     unpacked = write_synthetic(store.uploads / "u", frames=6, size=24)
-    config = make_config("draft", {"iterations": 100_000, "init.points": 300, **(options or {})}).model_dump(mode="json")
+    config = make_config("draft", {"iterations": 100_000, "init.points": 300, **(options or {})}).model_dump(
+        mode="json"
+    )
     return store.folder(store.create(JobSpec(name="job", capture="0" * 64, config=config), unpacked))
 
 
@@ -40,8 +42,8 @@ def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_p
 def test_a_training_that_comes_apart_ends_diverged_with_a_model_and_a_last_report(tmp_path: Path) -> None:
     store = Store(tmp_path)
     # A rate that grows out of all bounds: the first steps are sound, a few dozen later the numbers run out.
-    blow_up = {"iterations": 200, "evaluation.first": 2, "rates.offsets": [0.02, 1e30], "rates.features": [0.01, 1e30]}
-    folder = job(store, blow_up | {"guard.check_every": 5, "guard.patience": 10})
+    blow_up = {"iterations": 200, "evaluation.first": 2, "rates.deformation": [0.005, 1e30], "guard.patience": 5}
+    folder = job(store, blow_up)
     with trainer(folder) as process:
         assert process.stdout is not None
         said = process.stdout.read()

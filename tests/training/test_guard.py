@@ -138,6 +138,12 @@ def test_a_single_outlier_is_no_divergence() -> None:
     assert trend.problem() is None
 
 
+def test_an_easy_view_at_the_start_is_not_the_best_that_a_run_has_been() -> None:
+    trend = Trend(GuardConfig(patience=10))
+    _losses(trend, (0.01, 1), (0.3, 300))
+    assert trend.problem() is None
+
+
 def test_steps_right_after_a_growth_do_not_count_as_divergence() -> None:
     trend = Trend(GuardConfig(patience=10))
     _losses(trend, (0.1, 300))
