@@ -12,6 +12,9 @@ from graings.config import GuardConfig
 # Weight of the newest loss: single views differ by factors, fifty of them hardly do.
 NEWEST: Final = 0.02
 
+# So many losses are no mean yet.
+FEW: Final = 10
+
 # A loss this small may double without anybody seeing it.
 MARGIN: Final = 0.02
 
@@ -38,8 +41,8 @@ class Trend:
         # A plain mean at first: the very first losses would otherwise weigh on it for a hundred steps.
         self._count += 1
         self.mean += max(NEWEST, 1.0 / self._count) * (loss - self.mean)
-        # Few views are no mean yet: an easy one at the start would make all others look like a relapse.
-        self.best = self.mean if self._count * NEWEST < 1 else min(self.best, self.mean)
+        # An easy view at the start would make all others look like a relapse.
+        self.best = self.mean if self._count <= FEW else min(self.best, self.mean)
         if self.mean <= self._limit():
             self.above = 0
         elif self._settling == 0:
