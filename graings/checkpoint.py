@@ -2,8 +2,8 @@
 
 A run folder holds `checkpoints/<iteration>/` with `scene.safetensors` (the model), `state.safetensors` (what
 only training needs) and `checkpoint.json` (the rest); `checkpoints/best/` holds the same of the moment that held-out
-views liked best so far, which is delivered when training diverges. A checkpoint appears whole or not at all: it is written
-to a temporary folder, flushed and renamed. No pickle anywhere. Knows nothing of captures or jobs.
+views liked best so far, which may be delivered when training diverges. A checkpoint appears whole or not at all: it
+is written to a temporary folder, flushed and renamed. No pickle anywhere. Knows nothing of captures or jobs.
 """
 
 from __future__ import annotations

@@ -238,11 +238,12 @@ class Trainer:
         problem = self.guard.problem()
         last_of_pass = len(self.sampler.remaining) == 0
         if self.collapse.observe(drawn, scaffold.count * scaffold.slots, last_of_pass=last_of_pass):
-            if not self.collapse.mended:
+            problem = problem or self._lost()
+            if problem is None and not self.collapse.mended:
                 shift = mend(self.scene)
                 self.collapse.mended = True
                 events.append(f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g})")
-            elif problem is None and not self.guard.trend.small:
+            elif problem is None and not self.guard.trend.small:  # where the pictures are empty, so may the scene be
                 problem = "nothing was drawn any more, though there was something to see"
         due = self.iteration % every.snapshot_every == 0
         if problem is None and (due or self.iteration % every.check_every == 0):
