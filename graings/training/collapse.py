@@ -2,7 +2,7 @@
 
 Where the opacity of all children has fallen to one grey level or below, training would stand still for good. It is
 noticed after one pass over the training views and mended once, in the open; a second time the rates are to blame.
-Knows nothing of views or losses.
+Knows nothing of cameras or images.
 """
 
 from __future__ import annotations
@@ -22,29 +22,41 @@ LEAST_SHOWN: Final = 1e-3
 # The score that the median child is given again: what children are born with.
 SCORE: Final = 0.1
 
+# An empty picture with a loss up to this is about right: there is hardly anything to see.
+LOSS: Final = 0.02
+
 
 class Collapse:
-    """The largest share of children drawn in a view of the current pass, and whether it was mended before."""
+    """What the views of the current pass have shown, and whether a collapse was mended before.
+
+    Call `observe` for each view; after one that ended a pass in which nothing was shown, `missed` says whether there
+    was something to see.
+    """
 
     def __init__(self) -> None:
         self.mended = False
+        self.missed = False
         self._shown = 0.0
+        self._loss = 0.0
 
-    def observe(self, drawn: int, slots: int, *, last_of_pass: bool) -> bool:
+    def observe(self, drawn: int, slots: int, loss: float, *, last_of_pass: bool) -> bool:
         """Record a view that drew `drawn` of `slots` children; True when the pass it ends has shown a collapse."""
         self._shown = max(self._shown, drawn / max(slots, 1))
+        if math.isfinite(loss):  # what is not is the guard's to judge
+            self._loss = max(self._loss, loss)
         if not last_of_pass:
             return False
-        collapsed, self._shown = self._shown < LEAST_SHOWN, 0.0
+        collapsed, self.missed = self._shown < LEAST_SHOWN, self._loss > LOSS
+        self._shown = self._loss = 0.0
         return collapsed
 
     def state(self) -> dict[str, Any]:
         """Plain numbers to go on from."""
-        return {"mended": self.mended, "shown": self._shown}
+        return {"mended": self.mended, "shown": self._shown, "loss": self._loss}
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from what `state()` gave."""
-        self.mended, self._shown = bool(state["mended"]), float(state["shown"])
+        self.mended, self._shown, self._loss = bool(state["mended"]), float(state["shown"]), float(state["loss"])
 
 
 def mean_logits(scene: Scene) -> Float[Tensor, "anchor child"]:

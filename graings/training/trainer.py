@@ -159,7 +159,7 @@ class Trainer:
             self.optimizer.clear()
             events.append(f"skipped: {verdict.culprit} was not finite on {frame.name} at t = {frame.time:.4g}")
         events += self._adapt()
-        events += self._watch(len(composition.children))
+        events += self._watch(len(composition.children), float(loss.detach()))
         mse = float((result.color.detach() - target).square().mean())
         return StepReport(
             iteration=self.iteration,
@@ -231,19 +231,19 @@ class Trainer:
                 events.append(f"pruned {removed} anchors")
         return events
 
-    def _watch(self, drawn: int) -> list[str]:
+    def _watch(self, drawn: int, loss: float) -> list[str]:
         """Look after the scene's health and go back where it is lost; returns what happened, in words."""
         events: list[str] = []
         scaffold, every = self.scene.scaffold, self.config.guard
         problem = self.guard.problem()
         last_of_pass = len(self.sampler.remaining) == 0
-        if self.collapse.observe(drawn, scaffold.count * scaffold.slots, last_of_pass=last_of_pass):
+        if self.collapse.observe(drawn, scaffold.count * scaffold.slots, loss, last_of_pass=last_of_pass):
             problem = problem or self._lost()
             if problem is None and not self.collapse.mended:
                 shift = mend(self.scene)
                 self.collapse.mended = True
                 events.append(f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g})")
-            elif problem is None and not self.guard.trend.small:  # where the pictures are empty, so may the scene be
+            elif problem is None and self.collapse.missed:  # where the pictures are empty, so may the scene be
                 problem = "nothing was drawn any more, though there was something to see"
         due = self.iteration % every.snapshot_every == 0
         if problem is None and (due or self.iteration % every.check_every == 0):

@@ -58,11 +58,6 @@ class Trend:
         """Whether the mean is near the best, so that the moment is worth coming back to."""
         return self.mean is None or self.mean <= self._limit()
 
-    @property
-    def small(self) -> bool:
-        """Whether the mean is so small that a picture of nothing but background is about right."""
-        return self.mean is None or self.mean <= MARGIN
-
     def problem(self) -> str | None:
         """Why the run has come apart, or None."""
         if self.above < self._config.patience:
