@@ -1,8 +1,9 @@
 """Checkpoint: a model on disk, and everything needed to continue training it.
 
 A run folder holds `checkpoints/<iteration>/` with `scene.safetensors` (the model), `state.safetensors` (what
-only training needs) and `checkpoint.json` (the rest). A checkpoint appears whole or not at all: it is written
-to a temporary folder, flushed and renamed. No pickle anywhere. Knows nothing of captures or jobs.
+only training needs) and `checkpoint.json` (the rest); `checkpoints/best/` holds the same of the moment that held-out
+views liked best so far, which may be delivered when training diverges. A checkpoint appears whole or not at all: it
+is written to a temporary folder, flushed and renamed. No pickle anywhere. Knows nothing of captures or jobs.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from torch import Tensor
 from graings.camera import Camera, View
 from graings.config import SceneConfig, TrainConfig, restored
 from graings.errors import CheckpointError
-from graings.run_folder import CHECKPOINTS, FACTS_FILE, checkpoints
-from graings.run_folder import newest_checkpoint as newest_checkpoint  # part of this module's interface too
+from graings.run_folder import BEST, CHECKPOINTS, FACTS_FILE, checkpoints
+from graings.run_folder import best_checkpoint as best_checkpoint  # part of this module's interface too
+from graings.run_folder import newest_checkpoint as newest_checkpoint
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.units import Units
@@ -78,11 +80,17 @@ def save_checkpoint(
     config: TrainConfig,
     iteration: int,
     finished: bool,
+    best: bool = False,
+    instead_of_later: bool = False,
 ) -> Path:
-    """Write a checkpoint and drop all but the last two. Returns its folder; `CheckpointError` on a full disk."""
+    """Write a checkpoint and drop all but the last two. Returns its folder; `CheckpointError` on a full disk.
+
+    `best` writes the one beside them that is kept until a better one comes. `instead_of_later` drops later ones
+    as well, because training has given them up: this one is then the newest.
+    """
     folder = run / CHECKPOINTS
-    final = folder / f"{iteration:08d}"
-    part = folder / f".{iteration:08d}.part"
+    name = BEST if best else f"{iteration:08d}"
+    final, part = folder / name, folder / f".{name}.part"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(part, ignore_errors=True)
@@ -107,7 +115,7 @@ def save_checkpoint(
         for file in part.iterdir():
             _flush(file)
         _flush(part)
-        old = folder / f".{iteration:08d}.old"
+        old = folder / f".{name}.old"
         shutil.rmtree(old, ignore_errors=True)
         if final.exists():
             # The same iteration again (finishing right after a periodic checkpoint): the new one replaces it.
@@ -120,7 +128,10 @@ def save_checkpoint(
         raise CheckpointError(
             f"{final}: cannot write the checkpoint ({error}). Free some space; earlier ones are kept."
         ) from error
-    for outdated in checkpoints(run)[:-KEEP]:
+    kept = checkpoints(run)
+    later = [one for one in kept if one.name > name] if instead_of_later else []
+    kept = [one for one in kept if one not in later]
+    for outdated in (*later, *kept[:-KEEP]):
         shutil.rmtree(outdated, ignore_errors=True)
     return final
 

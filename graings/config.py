@@ -115,6 +115,9 @@ class DensityConfig(Part):
         description="Opacity score that a new anchor's brightest child starts with; null inherits the parent's.",
     )
     max_anchors: int = Field(12_000, ge=16, description="Hard budget of anchors; the largest gradients win.")
+    memory_mb: int = Field(
+        4096, ge=1, description="Memory in MB that anchors and one training step may take; growth stops where it ends."
+    )
     prune_from: int = Field(24_600, ge=0, description="First pruning: 80 % of the joint phase.")
     prune_until: int = Field(29_000, ge=0, description="Last pruning.")
     prune_every: int = Field(500, ge=1, description="Iterations between prunings.")
@@ -136,6 +139,23 @@ class RatesConfig(Part):
     opacity: tuple[float, float] = (0.002, 2e-5)
     residual: tuple[float, float] = (0.002, 2e-5)
     deformation: tuple[float, float] = (2e-3, 2e-5)
+
+
+class GuardConfig(Part):
+    """When a step is limited and when training goes back. Owner: `graings.training.guard`."""
+
+    clip: float = Field(
+        100.0, gt=1, le=1e6, description="A group's gradient above this many times its usual size is limited to it."
+    )
+    excess: float = Field(
+        2.0, gt=1, le=100, description="A mean loss above this many times the best one counts as diverging."
+    )
+    patience: int = Field(200, ge=1, description="Steps in a row that may diverge before training goes back.")
+    rollbacks: int = Field(
+        3, ge=0, le=20, description="Times training may go back to a good moment, each time with half the rates."
+    )
+    snapshot_every: int = Field(500, ge=1, description="Iterations between the moments kept to go back to.")
+    check_every: int = Field(100, ge=1, description="Iterations between checks of all parameters and moments.")
 
 
 class EvaluationConfig(Part):
@@ -161,6 +181,7 @@ class TrainConfig(Part):
     loss: LossConfig = LossConfig()
     density: DensityConfig = DensityConfig()
     rates: RatesConfig = RatesConfig()
+    guard: GuardConfig = GuardConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
 
     def scaled(self, mark: int) -> int:

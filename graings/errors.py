@@ -49,4 +49,4 @@ class KernelError(GraingsError):
 
 
 class DivergedError(GraingsError):
-    """Training cannot continue; the last good checkpoint is kept."""
+    """Training cannot continue; the best model so far is the newest checkpoint."""

@@ -15,6 +15,7 @@ from graings.errors import CheckpointError
 
 LOCK_FILE = ".training"
 CHECKPOINTS = "checkpoints"
+BEST = "best"
 FACTS_FILE = "checkpoint.json"
 
 
@@ -30,6 +31,12 @@ def newest_checkpoint(run: Path) -> Path | None:
     """The newest whole checkpoint of a run folder, or None."""
     found = checkpoints(run)
     return found[-1] if found else None
+
+
+def best_checkpoint(run: Path) -> Path | None:
+    """The checkpoint of the best held-out quality so far, or None; `newest_checkpoint` never is this folder."""
+    folder = run / CHECKPOINTS / BEST
+    return folder if (folder / FACTS_FILE).is_file() else None
 
 
 @contextmanager

@@ -21,7 +21,7 @@ class ExitCode(IntEnum):
     STOPPED = 75
     """Asked to stop (SIGTERM, SIGINT or the parent died); a checkpoint is written and training can continue."""
     DIVERGED = 76
-    """Training cannot continue from where it is; the last good checkpoint is kept. Never tried again."""
+    """Training came apart once more than it may go back; the best model is the newest checkpoint. Never tried again."""
 
 
 OUT_OF_MEMORY = (-9, 137)

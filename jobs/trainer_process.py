@@ -95,20 +95,27 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
 
     reported = logged = -LOG_EVERY_S
     held_out: dict[str, Any] = {}
-    for report in run:
-        now = time.monotonic()
-        if report.evaluation:
-            held_out = {"held_out_psnr": report.evaluation.psnr, "held_out_ssim_3dgs": report.evaluation.ssim_3dgs}
-        if now - reported >= REPORT_EVERY_S or report.evaluation or report.iteration == report.iterations:
-            progress.write({**_values(report), **held_out, "attempt": attempt})
-            reported = now
-        if now - logged >= LOG_EVERY_S or report.evaluation or report.events:
-            _log(_line(report))
-            logged = now
-        if stop.is_set() and report.iteration < report.iterations:
-            path = run.save()
-            _log(f"stopped at iteration {report.iteration}, checkpoint {path.name}")
-            return ExitCode.STOPPED
+    try:
+        for report in run:
+            now = time.monotonic()
+            if report.evaluation:
+                held_out = {"held_out_psnr": report.evaluation.psnr, "held_out_ssim_3dgs": report.evaluation.ssim_3dgs}
+            events = list(report.events)
+            # Events are reported at once: a reader should not have to wait to learn that training went back.
+            if events or now - reported >= REPORT_EVERY_S or report.evaluation or report.iteration == report.iterations:
+                progress.write({**_values(report), **held_out, "events": events, "attempt": attempt})
+                reported = now
+            if now - logged >= LOG_EVERY_S or report.evaluation or report.events:
+                _log(_line(report))
+                logged = now
+            if stop.is_set() and report.iteration < report.iterations:
+                path = run.save()
+                _log(f"stopped at iteration {report.iteration}, checkpoint {path.name}")
+                return ExitCode.STOPPED
+    except DivergedError as error:
+        ending = {"iteration": run.iteration, "iterations": config.iterations, "attempt": attempt}
+        progress.write({"phase": "diverged", **ending, **held_out, "events": [str(error)]})
+        raise
     _report(folder)
     _log("finished")
     return ExitCode.DONE

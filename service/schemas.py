@@ -13,7 +13,7 @@ from jobs.job import Job, JobState
 class ProgressResource(BaseModel):
     """The trainer's last report."""
 
-    phase: str = Field(description="loading, warmup, joint or static.")
+    phase: str = Field(description="loading, warmup, joint, static or diverged.")
     iteration: int
     iterations: int
     attempt: int
@@ -26,6 +26,7 @@ class ProgressResource(BaseModel):
     train_s: float | None = Field(None, description="Seconds trained so far, evaluations not counted.")
     held_out_psnr: float | None = Field(None, description="Of the last evaluation of this attempt, in dB.")
     held_out_ssim_3dgs: float | None = None
+    events: list[str] = Field([], description="What happened in this step: growth, skipped steps, going back.")
 
 
 class JobResource(BaseModel):

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from graings.config import SceneConfig
 from graings.scene.encoding import encoding_width, frequency_encoding
 from graings.scene.perceptron import perceptron, weights_and_biases
+from graings.scene.saturate import sigmoid, tanh
 
 
 class CanonicalAppearance(nn.Module):
@@ -45,7 +46,7 @@ class CanonicalAppearance(nn.Module):
     ) -> Float[Tensor, "drawn 3"]:
         """c_can of the given flat child slots (anchor * k + child)."""
         raw = perceptron(torch.cat([features, directions], dim=-1), *weights_and_biases(self.color))
-        return raw.view(-1, 3).index_select(0, children).sigmoid()
+        return sigmoid(raw.view(-1, 3).index_select(0, children))
 
     def opacity_logits(
         self, features: Float[Tensor, "anchor feature"], directions: Float[Tensor, "anchor 3"]
@@ -82,4 +83,4 @@ class ResidualField(nn.Module):
 
     def bounded(self, raw: Float[Tensor, "*rows"]) -> Float[Tensor, "*rows"]:
         """`raw` within (-eta, eta)."""
-        return self.scale * torch.tanh(raw)
+        return self.scale * tanh(raw)

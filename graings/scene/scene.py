@@ -23,6 +23,7 @@ from graings.scene.canonical import StaticMLP, unlearned
 from graings.scene.children import Children, compose, gather
 from graings.scene.clip import clip
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP, deformation_from
+from graings.scene.saturate import tanh
 from graings.scene.scaffold import Scaffold
 
 
@@ -75,9 +76,7 @@ class Scene(nn.Module):
         moment = torch.tensor([time], dtype=dtype)
         directions = self.directions(eye)
 
-        scores = torch.tanh(
-            self.appearance.opacity_logits(features, directions) + scaffold.opacity_offsets.unsqueeze(-1)
-        )
+        scores = tanh(self.appearance.opacity_logits(features, directions) + scaffold.opacity_offsets.unsqueeze(-1))
         change: Tensor | None = None
         residual = self.residual if self.temporal else None
         if residual is not None:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from graings.config import RatesConfig, TrainConfig
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
+from graings.training.guard import Gradient
 
 ADAM_EPSILON = 1e-15  # gradients of one Gaussian are tiny; the usual 1e-8 would damp them (3DGS)
 
@@ -47,7 +48,7 @@ class Optimizer:
     """Adam for one scene.
 
     `step(iteration)` sets the rates for that iteration, steps the groups whose parameters have gradients and
-    clears the gradients.
+    clears the gradients. `damping` is a factor on all rates.
     """
 
     def __init__(self, scene: Scene, config: TrainConfig, joint_from: int) -> None:
@@ -55,6 +56,7 @@ class Optimizer:
         self.rates: RatesConfig = config.rates
         self.iterations = config.iterations
         self.joint_from = joint_from
+        self.damping = 1.0
         members: dict[str, list[nn.Parameter]] = {}
         for name, parameter in scene.named_parameters():
             members.setdefault(_group_of(name), []).append(parameter)
@@ -73,9 +75,40 @@ class Optimizer:
     def step(self, iteration: int) -> None:
         """Apply the gradients at the rates of `iteration`."""
         for group in self.adam.param_groups:
-            group["lr"] = self.rate(group["name"], iteration)
+            group["lr"] = self.damping * self.rate(group["name"], iteration)
         self.adam.step()
         self.clear()
+
+    def gradients(self) -> list[Gradient]:
+        """The gradients that the next step would apply."""
+        return [
+            Gradient(name, _group_of(name), parameter.grad)
+            for name, parameter in self.scene.named_parameters()
+            if parameter.grad is not None and parameter.grad.numel() > 0
+        ]
+
+    def limit(self, group: str, times: float, norm: float) -> None:
+        """Limit the gradients of `group`: no entry above `times` its own usual size, and all together at most `norm`.
+
+        The usual size is the root of Adam's second moment as it is stored, so that `times` = 100 lets the moment grow
+        11-fold and the following steps shrink to 30 %, however young the moment is. An entry without one is limited
+        with its group only. A single spike thus neither freezes its own parameter nor takes its group down with it.
+        """
+        members = next(members for members in self.adam.param_groups if members["name"] == group)
+        gradients: list[Tensor] = []
+        for parameter in members["params"]:
+            if parameter.grad is None:
+                continue
+            state = self.adam.state.get(parameter)
+            if state:
+                most = state["exp_avg_sq"].sqrt().mul_(times)
+                most.masked_fill_(most == 0, math.inf)
+                parameter.grad.clamp_(min=-most, max=most)
+            gradients.append(parameter.grad)
+        left = math.hypot(*(float(torch.linalg.vector_norm(gradient.double())) for gradient in gradients))
+        if left > norm:
+            # A power of two keeps every bit of the gradient, and the result does not hang on the norm's last one.
+            torch._foreach_mul_(gradients, 2.0 ** math.floor(math.log2(norm / left)))
 
     def clear(self) -> None:
         """Drop all gradients."""

@@ -1,6 +1,7 @@
 """TrainingRun: one training in one folder — trainer, evaluations, checkpoints and metrics.
 
-Iterating it trains. Whoever iterates may stop at any step and call `save()`; `resume` continues bit for bit.
+Iterating it trains. Whoever iterates may stop at any step and call `save()`; `resume` continues bit for bit. A run
+that diverges ends with `DivergedError` after its best model was made the newest checkpoint.
 Knows nothing of terminals, jobs or HTTP.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.checkpoint import (
     TrainingState,
+    best_checkpoint,
     load_model,
     load_state,
     newest_checkpoint,
@@ -26,7 +28,7 @@ from graings.checkpoint import (
     scene_bytes,
 )
 from graings.config import TrainConfig, restored
-from graings.errors import CheckpointError
+from graings.errors import CheckpointError, DivergedError
 from graings.evaluation import evaluate, frames_per_second, subset
 from graings.machine import machine_facts, version_facts
 from graings.metrics import Lpips, SplitMetrics
@@ -86,6 +88,8 @@ class TrainingRun:
         self._curve: list[dict[str, Any]] = []
         self._events: list[dict[str, Any]] = []
         self._last_gaussians = 0
+        self._best_psnr: float | None = None
+        self._diverged: str | None = None
 
     @classmethod
     def create(cls, capture: Path, folder: Path, config: TrainConfig) -> TrainingRun:
@@ -131,6 +135,9 @@ class TrainingRun:
             run._curve = list(state.facts["curve"])
             run._events = list(state.facts["events"])
             run._last_gaussians = int(state.facts["gaussians"])
+        best = best_checkpoint(folder)
+        if best is not None:
+            run._best_psnr = load_state(best).facts["curve"][-1]["psnr"]
         return run
 
     @property
@@ -150,7 +157,11 @@ class TrainingRun:
 
     def __iter__(self) -> Iterator[RunReport]:
         with sole_trainer(self.folder):
-            yield from self._train()
+            try:
+                yield from self._train()
+            except DivergedError as error:
+                self._deliver(str(error))
+                raise
 
     def _train(self) -> Iterator[RunReport]:
         if self.iteration >= self.iterations and not self._is_complete():
@@ -162,22 +173,44 @@ class TrainingRun:
             self._clock.add(step.phase, step.seconds)
             self._last_gaussians = step.gaussians
             rate.add(step.seconds)
-            self._events += [{"iteration": step.iteration, "what": what} for what in step.events]
+            self._note(step.events)
             last = step.iteration == self.iterations
+            saving = step.iteration % self.config.evaluation.checkpoint_every == 0
+            # Nobody looks at a scene, or saves it, that is not finite.
+            found = self._check() if last or saving or step.iteration in due else ()
             point = self._evaluate() if step.iteration in due and not last else None
-            if step.iteration % self.config.evaluation.checkpoint_every == 0 and not last:
-                self.save()
+            if saving and not last:
+                self._save()
             if last:
                 point = self._finish()
             yield RunReport(
-                **{part.name: getattr(step, part.name) for part in fields(step)},
+                **({part.name: getattr(step, part.name) for part in fields(step)} | {"events": step.events + found}),
                 iterations_per_s=rate.per_second(),
                 train_s=self._clock.train_s(),
                 evaluation=point,
             )
 
-    def save(self, *, finished: bool = False) -> Path:
-        """Write a checkpoint now; returns its folder. Raises `CheckpointError` when that fails."""
+    def save(self) -> Path:
+        """Write a checkpoint now; returns its folder. Raises `CheckpointError` when that fails.
+
+        A scene that is not finite is never written: training goes back first, or raises `DivergedError`.
+        """
+        try:
+            self._check()
+        except DivergedError as error:
+            self._deliver(str(error))
+            raise
+        return self._save()
+
+    def _note(self, events: Iterable[str]) -> None:
+        self._events += [{"iteration": self.iteration, "what": what} for what in events]
+
+    def _check(self) -> tuple[str, ...]:
+        found = tuple(self._trainer.check())
+        self._note(found)
+        return found
+
+    def _save(self, *, finished: bool = False, best: bool = False, instead_of_later: bool = False) -> Path:
         started = time.perf_counter()
         tensors, facts = self._trainer.state()
         path = save_checkpoint(
@@ -200,6 +233,8 @@ class TrainingRun:
             config=self.config,
             iteration=self.iteration,
             finished=finished,
+            best=best,
+            instead_of_later=instead_of_later,
         )
         self._clock.add("checkpoint", time.perf_counter() - started)
         return path
@@ -216,6 +251,9 @@ class TrainingRun:
         metrics = evaluate(self._trainer.scene, frames, self.images, self.config.capture.background_rgb())
         point = self._point(metrics)
         self._clock.add("evaluation", time.perf_counter() - started)
+        if self._best_psnr is None or point.psnr > self._best_psnr:
+            self._best_psnr = point.psnr
+            self._save(best=True)
         self._write_metrics({})
         return point
 
@@ -238,19 +276,47 @@ class TrainingRun:
 
     def _finish(self) -> EvaluationPoint | None:
         """Evaluate all of val, write the final checkpoint, metrics and curve."""
-        point, splits = None, {}
+        point = None
         if self.capture.val:
             started = time.perf_counter()
             background = self.config.capture.background_rgb()
-            scene = self._trainer.scene
-            curve = self._held_out()
-            point = self._point(evaluate(scene, curve, self.images, background))
-            full = evaluate(scene, self.capture.val, self.images, background, lpips=Lpips.find())
-            splits["val"] = full.to_json()
+            point = self._point(evaluate(self._trainer.scene, self._held_out(), self.images, background))
             self._clock.add("evaluation", time.perf_counter() - started)
-        self.save(finished=True)
+        splits = self._splits()
+        self._save(finished=True)
         self._write_metrics(splits)
         return point
+
+    def _splits(self) -> dict[str, Any]:
+        """Metrics of all of val, as a finished run reports them."""
+        if not self.capture.val:
+            return {}
+        started = time.perf_counter()
+        background = self.config.capture.background_rgb()
+        full = evaluate(self._trainer.scene, self.capture.val, self.images, background, lpips=Lpips.find())
+        self._clock.add("evaluation", time.perf_counter() - started)
+        return {"val": full.to_json()}
+
+    def _deliver(self, reason: str) -> None:
+        """Training has diverged: make the best model the newest checkpoint, and say so in the metrics.
+
+        The best is that of the last good moment or of the best evaluation, whichever held-out views like more. What
+        was saved after it is dropped: nobody should find it in its place.
+        """
+        self._note([f"diverged: {reason}"])
+        self._diverged = reason
+        guard = self._trainer.guard
+        self._trainer.restore()
+        best, frames = best_checkpoint(self.folder), self._held_out()
+        if best is not None and self._best_psnr is not None and frames:
+            now = evaluate(self._trainer.scene, frames, self.images, self.config.capture.background_rgb())
+            if now.psnr is None or self._best_psnr >= now.psnr:
+                state = load_state(best)
+                self._trainer.adopt(load_model(best).scene, state.tensors, state.facts["trainer"], guard)
+                self._last_gaussians = int(state.facts["gaussians"])
+        splits = self._splits()
+        self._save(instead_of_later=True)
+        self._write_metrics(splits)
 
     def _is_complete(self) -> bool:
         """Whether the metrics document is that of the last iteration."""
@@ -307,6 +373,10 @@ class TrainingRun:
                 "notes": list(self.capture.notes),
             },
             "skipped_steps": self._trainer.guard.skipped,
+            "clipped_steps": self._trainer.guard.clipped,
+            "rollbacks": self._trainer.guard.rollbacks,
+            "diverged": self._diverged is not None,
+            "diverged_reason": self._diverged,
             "machine": machine,
             "versions": versions,
             "seed": self.config.seed,

@@ -5,6 +5,7 @@ Never prints, logs, saves or asks: whoever iterates decides. Knows nothing of fi
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Iterator
@@ -17,18 +18,28 @@ from torch import Tensor
 from graings.capture.capture import Capture, Frame
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
+from graings.errors import DivergedError
 from graings.raster.photometric import photometric
 from graings.render import draw
 from graings.scene.scene import Composition, Scene
 from graings.training import density, losses
+from graings.training.budget import affordable_anchors
+from graings.training.collapse import SCORE, Collapse, mean_logits, mend
 from graings.training.density import DensityStatistics
-from graings.training.guard import Guard
+from graings.training.guard import Gradient, Guard, first_not_finite
 from graings.training.initialize import make_scene
 from graings.training.optimizer import Optimizer
+from graings.training.snapshots import Snapshots
 from graings.training.streams import Streams, ViewSampler
 
 # The temporal term looks at no fewer children than this (decision 10).
 MIN_TEMPORAL_SAMPLE = 2_000
+
+# Every time training goes back, it goes on with this share of the rates.
+RATE_CUT = 0.5
+
+# What the guard calls the gradients of the projected centres, which growth looks at.
+SCREEN = "screen"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,14 +93,18 @@ class Trainer:
         self.iteration = 0
         self.scene, self.voxel_size = make_scene(capture, images, config, self.streams)
         self.next_uid = self.scene.scaffold.count
+        budget = affordable_anchors(config.scene, config.density.memory_mb)
+        self._density = config.density.model_copy(update={"max_anchors": min(config.density.max_anchors, budget)})
+        self.snapshots = Snapshots()
         self._attach()
 
     def _attach(self) -> None:
-        """Everything whose shape follows the scene."""
+        """Everything whose shape follows the scene, and what watches over it."""
         scaffold = self.scene.scaffold
         self.optimizer = Optimizer(self.scene, self.config, joint_from=self.phases[-1].first - 1)
         self.statistics = DensityStatistics(scaffold.count, scaffold.slots)
-        self.guard = Guard()
+        self.guard = Guard(self.config.guard)
+        self.collapse = Collapse()
 
     def __iter__(self) -> Iterator[StepReport]:
         while self.iteration < self.config.iterations:
@@ -100,8 +115,10 @@ class Trainer:
         return next(phase for phase in self.phases if iteration <= phase.last)
 
     def step(self) -> StepReport:
-        """Take one step. Raises `DivergedError` where the guard gives up."""
+        """Take one step. Raises `DivergedError` when training went wrong once more than it may go back."""
         started = time.perf_counter()
+        if len(self.snapshots) == 0:
+            self._take_snapshot()  # the beginning, or the checkpoint that training goes on from
         self.iteration += 1
         phase = self.phase(self.iteration)
         self.scene.temporal = phase.temporal
@@ -118,8 +135,17 @@ class Trainer:
             loss.backward()
 
         events: list[str] = []
-        if self.guard.passes(loss.detach(), self.scene.named_parameters()):
-            if self._counts_statistics() and offset.grad is not None:
+        gradients = self.optimizer.gradients()
+        if offset.grad is not None:
+            gradients.append(Gradient("the projected centres", SCREEN, offset.grad))
+        verdict = self.guard.judge(self.iteration, loss.detach(), gradients)
+        if verdict.culprit is None:
+            for group, (norm, limit) in verdict.limits.items():
+                events.append(f"clipped: gradients of {group} at {norm:.3g} limited to {limit:.3g} on {frame.name}")
+                if group != SCREEN:
+                    self.optimizer.limit(group, self.config.guard.clip, limit)
+            # A step out of all proportion says nothing about where anchors are wanted.
+            if self._counts_statistics() and offset.grad is not None and not verdict.limits:
                 visible = result.radii.amax(-1) > 0
                 self.statistics.observe(
                     composition.children,
@@ -131,8 +157,9 @@ class Trainer:
             self.optimizer.step(self.iteration)
         else:
             self.optimizer.clear()
-            events.append(f"skipped: non-finite step on {frame.name}")
+            events.append(f"skipped: {verdict.culprit} was not finite on {frame.name} at t = {frame.time:.4g}")
         events += self._adapt()
+        events += self._watch(len(composition.children), float(loss.detach()))
         mse = float((result.color.detach() - target).square().mean())
         return StepReport(
             iteration=self.iteration,
@@ -204,23 +231,110 @@ class Trainer:
                 events.append(f"pruned {removed} anchors")
         return events
 
-    def _grow(self) -> list[str]:
-        scene, config = self.scene, self.config.density
-        with torch.no_grad():
-            # The mean direction stands for all views: where opacity looks at it, a newborn has no camera yet.
-            still = torch.zeros_like(scene.scaffold.anchors)
-            logits = scene.appearance.opacity_logits(scene.scaffold.features, still)
-            logits = logits + scene.scaffold.opacity_offsets.unsqueeze(-1)
-            growth = density.grow(
-                scene.scaffold, self.statistics, logits, config, self.voxel_size, self.next_uid, self.streams["growth"]
+    def _watch(self, drawn: int, loss: float) -> list[str]:
+        """Look after the scene's health and go back where it is lost; returns what happened, in words."""
+        events: list[str] = []
+        scaffold, every = self.scene.scaffold, self.config.guard
+        problem = self.guard.problem()
+        last_of_pass = len(self.sampler.remaining) == 0
+        if self.collapse.observe(drawn, scaffold.count * scaffold.slots, loss, last_of_pass=last_of_pass):
+            problem = problem or self._lost()
+            if problem is None and not self.collapse.mended:
+                shift = mend(self.scene)
+                self.collapse.mended = True
+                events.append(f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g})")
+            elif problem is None and self.collapse.missed:  # where the pictures are empty, so may the scene be
+                problem = "nothing was drawn any more, though there was something to see"
+        due = self.iteration % every.snapshot_every == 0
+        if problem is None and (due or self.iteration % every.check_every == 0):
+            problem = self._lost()
+        if problem is not None:
+            events.append(self._go_back(problem))
+        elif due and self.guard.trend.healthy:
+            self._take_snapshot()
+        return events
+
+    def check(self) -> list[str]:
+        """Make sure that the scene is finite before somebody looks at it or saves it, going back where it is not.
+
+        Returns what happened, in words. Raises `DivergedError` as `step` does.
+        """
+        problem = self._lost()
+        return [] if problem is None else [self._go_back(problem)]
+
+    def _lost(self) -> str | None:
+        """Which parameter or moment holds a number that is none, in words, or None."""
+        tensors = {name: values.detach() for name, values in self.scene.named_parameters()}
+        name = first_not_finite(tensors | self.optimizer.state())
+        return None if name is None else f"{name} was not finite any more"
+
+    def _take_snapshot(self) -> None:
+        self.snapshots.take(self.iteration, self.scene, *self.state())
+
+    def _go_back(self, problem: str) -> str:
+        """Restore a good moment and go on more slowly and in another order of views. The iterations are spent."""
+        if self.guard.rollbacks >= self.config.guard.rollbacks:
+            raise DivergedError(
+                f"Training diverged at iteration {self.iteration} after going back {self.guard.rollbacks} times: "
+                f"{problem}. The best model is kept. Train again with smaller rates (`rates`)."
             )
+        iteration, before, mended = self.iteration, self.guard, self.collapse.mended
+        snapshot = self.snapshots.back()
+        self.load(copy.deepcopy(snapshot.scene), snapshot.tensors, snapshot.facts)
+        self.iteration = iteration
+        self.guard.rolled_back(before)
+        self.guard.rollbacks += 1
+        self.collapse.mended = mended
+        self._slow_down()
+        self.sampler = self._sampler()
+        return (
+            f"rolled back to iteration {snapshot.iteration}: {problem}; "
+            f"rates at {self.optimizer.damping:.3g} of their plan from here on"
+        )
+
+    def _slow_down(self) -> None:
+        self.optimizer.damping = RATE_CUT**self.guard.rollbacks
+
+    def _sampler(self) -> ViewSampler:
+        """Views in the order of this attempt: the one that failed is not repeated."""
+        attempt = self.guard.rollbacks
+        return ViewSampler(len(self.capture.train), self.streams[f"sampler.{attempt}" if attempt else "sampler"])
+
+    def restore(self) -> None:
+        """Return to the newest good moment, and its iteration, for good: the guard has given up.
+
+        What has happened since stays counted, and the rates stay as low as they were.
+        """
+        snapshot, before = self.snapshots.newest, self.guard
+        self.adopt(copy.deepcopy(snapshot.scene), snapshot.tensors, snapshot.facts, before)
+
+    def adopt(self, scene: Scene, tensors: dict[str, Tensor], facts: dict[str, Any], before: Guard) -> None:
+        """As `load`, for an earlier moment of the same run whose guard is `before`."""
+        self.load(scene, tensors, facts)
+        self.guard.rolled_back(before)
+        self._slow_down()
+        self.sampler = self._sampler()
+
+    def _grow(self) -> list[str]:
+        scene, config = self.scene, self._density
+        growth = density.grow(
+            scene.scaffold,
+            self.statistics,
+            mean_logits(scene),
+            config,
+            self.voxel_size,
+            self.next_uid,
+            self.streams["growth"],
+        )
         self.statistics.forget_grown(config.min_observations)
+        capped = ["growth_capped: the budget of anchors is used up or too many wanted to grow"] if growth.capped else []
         if len(growth) == 0:
-            return []
+            return capped
         self.optimizer.append(growth.rows)
         self.statistics.resize(append=len(growth))
         self.next_uid += len(growth)
-        return [f"grew {len(growth)} anchors"] + (["growth capped by the budget"] if growth.capped else [])
+        self.guard.trend.grown()
+        return [f"grew {len(growth)} anchors", *capped]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Everything beside the scene that the next step depends on: tensors and JSON."""
@@ -228,12 +342,14 @@ class Trainer:
         tensors |= {f"statistics/{name}": value for name, value in self.statistics.state().items()}
         tensors |= {f"streams/{name}": value for name, value in self.streams.state().items()}
         tensors["sampler/remaining"] = self.sampler.remaining
+        norms, guard = self.guard.state()
+        tensors |= {f"guard/{name}": value for name, value in norms.items()}
         facts = {
             "iteration": self.iteration,
             "next_uid": self.next_uid,
             "voxel_size": self.voxel_size,
-            "skipped": self.guard.skipped,
-            "consecutive_skips": self.guard.consecutive,
+            "guard": guard,
+            "collapse": self.collapse.state(),
         }
         return tensors, facts
 
@@ -241,16 +357,21 @@ class Trainer:
         """Continue from a scene and what `state()` gave with it."""
         self.scene = scene
         self._attach()
-        parts: dict[str, dict[str, Tensor]] = {"adam": {}, "statistics": {}, "streams": {}, "sampler": {}}
+        parts: dict[str, dict[str, Tensor]] = {
+            name: {} for name in ("adam", "statistics", "streams", "sampler", "guard")
+        }
         for key, value in tensors.items():
             part, _, name = key.partition("/")
             parts[part][name] = value
         self.optimizer.load(parts["adam"])
         self.statistics.load(parts["statistics"])
         self.streams.load(parts["streams"])
+        if "guard" in facts:  # checkpoints of 0.1.0 have none: their guard begins with them
+            self.guard.load(parts["guard"], facts["guard"])
+            self.collapse.load(facts["collapse"])
+        self._slow_down()
+        self.sampler = self._sampler()
         self.sampler.remaining = parts["sampler"]["remaining"].clone()
         self.iteration = int(facts["iteration"])
         self.next_uid = int(facts["next_uid"])
         self.voxel_size = float(facts["voxel_size"])
-        self.guard.skipped = int(facts["skipped"])
-        self.guard.consecutive = int(facts["consecutive_skips"])

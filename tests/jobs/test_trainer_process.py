@@ -9,16 +9,20 @@ from typing import NoReturn
 import pytest
 
 from graings.capture.synthetic import write_synthetic
+from graings.checkpoint import load_model
 from graings.config import make_config
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
+from jobs.progress import last_progress, read_progress
 from jobs.store import JobFolder, Store
 from jobs.trainer_process import _report
 
 
-def job(store: Store, iterations: int = 100_000) -> JobFolder:
+def job(store: Store, options: dict[str, object] | None = None) -> JobFolder:
     unpacked = write_synthetic(store.uploads / "u", frames=6, size=24)
-    config = make_config("draft", {"iterations": iterations, "init.points": 300}).model_dump(mode="json")
+    config = make_config("draft", {"iterations": 100_000, "init.points": 300, **(options or {})}).model_dump(
+        mode="json"
+    )
     return store.folder(store.create(JobSpec(name="job", capture="0" * 64, config=config), unpacked))
 
 
@@ -40,7 +44,7 @@ def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_p
 
 
 def test_a_finished_job_has_its_report(tmp_path: Path) -> None:
-    folder = job(Store(tmp_path), iterations=12)
+    folder = job(Store(tmp_path), {"iterations": 12})
     with trainer(folder) as process:
         assert process.wait(60) == ExitCode.DONE
     document = json.loads((folder.report / "work_precision.json").read_text())
@@ -58,3 +62,25 @@ def test_trouble_with_the_report_is_logged_and_ends_nothing(
     monkeypatch.setattr("jobs.trainer_process.report_runs", broken)
     _report(job(Store(tmp_path)))
     assert "no report: RuntimeError: no ink" in capsys.readouterr().err
+
+
+def test_a_training_that_comes_apart_ends_diverged_with_a_model_and_a_last_report(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    # A rate that grows out of all bounds: the first steps are sound, a few dozen later the numbers run out.
+    blow_up = {"iterations": 200, "evaluation.first": 2, "rates.deformation": [0.005, 1e30], "guard.patience": 5}
+    folder = job(store, blow_up)
+    with trainer(folder) as process:
+        assert process.stdout is not None
+        said = process.stdout.read()
+        assert process.wait(60) == ExitCode.DIVERGED
+    assert "diverged" in json.loads(said)["error"]
+    model = load_model(folder.run)
+    assert folder.checkpoint() == model.iteration
+    assert all(bool(values.isfinite().all()) for values in model.scene.state_dict().values())
+    assert json.loads(folder.metrics.read_text())["diverged"]
+    last = last_progress(folder.progress)
+    assert last is not None
+    assert (last["phase"], last["iteration"]) == ("diverged", model.iteration)
+    reports, _ = read_progress(folder.progress, 0)
+    events = [event for _, report in reports for event in report.get("events", [])]
+    assert sum(event.startswith("rolled back") for event in events) == 3

@@ -1,36 +1,162 @@
-"""Non-finite steps are skipped, and three in a row end the run."""
+"""What the guard lets through, limits, skips and gives up on (STAB-10), on numbers alone."""
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
-from torch import nn
+from torch import Tensor
 
-from graings.errors import DivergedError
-from graings.training.guard import Guard
+from graings.config import GuardConfig
+from graings.training.guard import FEWEST, MAX_RECENT_SKIPS, MEMORY, WINDOW, Gradient, Guard, first_not_finite
+from graings.training.trend import SETTLING, Trend
+
+ONE, NAN = torch.tensor(1.0), torch.tensor(float("nan"))
+
+
+def _gradient(values: Tensor, group: str = "g") -> list[Gradient]:
+    return [Gradient("p", group, values)]
+
+
+def _settled() -> Guard:
+    """A guard that has seen enough gradients of norm 1."""
+    guard = Guard(GuardConfig())
+    for iteration in range(WINDOW):
+        assert not guard.judge(iteration, ONE, _gradient(torch.tensor([0.6, 0.8]))).limits
+    return guard
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_one_bad_entry_of_a_gradient_fails_the_step(bad: float) -> None:
-    parameter = nn.Parameter(torch.zeros(100))
-    parameter.grad = torch.ones(100)
-    guard = Guard()
-    assert guard.passes(torch.tensor(1.0), [("p", parameter)])
-    parameter.grad[37] = bad
-    assert not guard.passes(torch.tensor(1.0), [("p", parameter)])
-    assert not guard.passes(torch.tensor(bad), [])
+def test_one_bad_entry_of_a_gradient_is_named(bad: float) -> None:
+    guard, values = Guard(GuardConfig()), torch.ones(100)
+    assert guard.judge(1, ONE, _gradient(values)).culprit is None
+    values[37] = bad
+    assert guard.judge(2, ONE, _gradient(values)).culprit == "the gradient of p"
+    assert guard.judge(3, torch.tensor(bad), []).culprit == "the loss"
     assert guard.skipped == 2
 
 
-def test_a_large_finite_gradient_passes() -> None:
-    parameter = nn.Parameter(torch.zeros(100))
-    parameter.grad = torch.full((100,), 1e30)
-    assert Guard().passes(torch.tensor(1.0), [("p", parameter)])
+def test_a_gradient_whose_square_overflows_is_large_and_not_wrong() -> None:
+    assert Guard(GuardConfig()).judge(1, ONE, _gradient(torch.full((100,), 1e30))).culprit is None
 
 
-def test_three_bad_steps_in_a_row_end_training_and_a_good_one_forgives() -> None:
-    guard, nan, one = Guard(), torch.tensor(float("nan")), torch.tensor(1.0)
-    for loss in (nan, nan, one, nan, nan):
-        guard.passes(loss, [])
-    with pytest.raises(DivergedError, match="the loss"):
-        guard.passes(nan, [])
+def test_a_group_far_above_its_median_is_limited_and_the_others_are_not() -> None:
+    guard = _settled()
+    usual = Gradient("q", "h", torch.ones(1))
+    verdict = guard.judge(WINDOW, ONE, [*_gradient(torch.tensor([300.0, 400.0])), usual])
+    assert verdict.limits == {"g": (pytest.approx(500.0), pytest.approx(100.0))}
+    assert guard.clipped == 1
+    assert not guard.judge(WINDOW + 1, ONE, _gradient(torch.tensor([60.0, 79.0]))).limits
+
+
+def test_nothing_is_limited_before_the_usual_size_is_known() -> None:
+    guard = Guard(GuardConfig())
+    for iteration in range(FEWEST):
+        assert not guard.judge(iteration, ONE, _gradient(torch.tensor([10.0**iteration]))).limits
+
+
+def test_a_lasting_change_of_size_becomes_the_usual_size() -> None:
+    guard = _settled()
+    limited = [bool(guard.judge(i, ONE, _gradient(torch.tensor([1e3]))).limits) for i in range(2 * WINDOW)]
+    assert limited[0]
+    assert not limited[-1]
+
+
+def test_three_bad_steps_in_a_row_are_a_problem_and_a_good_one_forgives() -> None:
+    guard = Guard(GuardConfig())
+    for iteration, loss in enumerate((NAN, NAN, ONE, NAN, NAN)):
+        guard.judge(iteration, loss, [])
+        assert guard.problem() is None
+    guard.judge(5, NAN, [])
+    assert guard.problem() == "the loss was not finite in 3 steps in a row"
+
+
+def test_ten_bad_steps_among_a_thousand_are_a_problem_and_old_ones_are_forgotten() -> None:
+    often, rarely = Guard(GuardConfig()), Guard(GuardConfig())
+    for number in range(MAX_RECENT_SKIPS):
+        for guard, apart in ((often, 50), (rarely, MEMORY // MAX_RECENT_SKIPS + 12)):
+            assert guard.problem() is None
+            guard.judge(number * apart, NAN, [])
+            guard.judge(number * apart + 1, ONE, [])
+    assert "10 of the last 1000 steps" in str(often.problem())
+    assert rarely.problem() is None
+
+
+def test_a_guard_continues_from_its_state_with_the_same_verdicts() -> None:
+    one = _settled()
+    one.judge(WINDOW, NAN, [])
+    other = Guard(GuardConfig())
+    other.load(*one.state())
+    assert other.state()[1] == one.state()[1]
+    large = _gradient(torch.tensor([1e4]))
+    assert other.judge(WINDOW + 1, ONE, large) == one.judge(WINDOW + 1, ONE, large)
+
+
+def test_after_going_back_counts_stay_and_the_reasons_to_go_back_are_gone() -> None:
+    before = Guard(GuardConfig())
+    for iteration in range(3):
+        before.judge(iteration, NAN, [])
+    after = Guard(GuardConfig())
+    after.rolled_back(before)
+    assert (after.skipped, after.problem()) == (3, None)
+
+
+def test_the_first_tensor_that_is_not_finite_is_named() -> None:
+    tensors = {"a": torch.ones(3), "b": torch.tensor([1.0, float("inf")]), "c": torch.tensor(float("nan"))}
+    assert first_not_finite(tensors) == "b"
+    assert first_not_finite({"a": torch.full((3,), 1e38)}) is None
+    assert first_not_finite({}) is None
+
+
+def _losses(trend: Trend, *losses: tuple[float, int]) -> None:
+    for loss, times in losses:
+        for _ in range(times):
+            trend.add(loss)
+
+
+def test_a_loss_that_stays_far_above_its_best_is_divergence() -> None:
+    trend = Trend(GuardConfig(patience=200))
+    _losses(trend, (0.1, 300), (0.5, 150))
+    assert trend.problem() is None
+    assert not trend.healthy
+    _losses(trend, (0.5, 100))
+    assert "after it had been 0.1" in str(trend.problem())
+
+
+@pytest.mark.parametrize(("best", "later"), [(0.001, 0.015), (0.1, 0.19)])
+def test_a_loss_that_doubles_unseen_or_not_quite_is_no_divergence(best: float, later: float) -> None:
+    trend = Trend(GuardConfig(patience=10))
+    _losses(trend, (best, 300), (later, 1000))
+    assert trend.problem() is None
+    assert trend.healthy
+
+
+def test_a_single_outlier_is_no_divergence() -> None:
+    trend = Trend(GuardConfig(patience=100))
+    _losses(trend, (0.1, 300), (5.0, 1), (0.1, 300))
+    assert trend.problem() is None
+
+
+def test_an_easy_view_at_the_start_is_not_the_best_that_a_run_has_been() -> None:
+    trend = Trend(GuardConfig(patience=10))
+    _losses(trend, (0.01, 1), (0.3, 300))
+    assert trend.problem() is None
+
+
+def test_steps_right_after_a_growth_do_not_count_as_divergence() -> None:
+    trend = Trend(GuardConfig(patience=10))
+    _losses(trend, (0.1, 300))
+    trend.grown()
+    _losses(trend, (5.0, SETTLING))
+    assert trend.problem() is None
+    _losses(trend, (5.0, 10))
+    assert trend.problem() is not None
+
+
+def test_a_trend_continues_from_its_state() -> None:
+    one, other = Trend(GuardConfig()), Trend(GuardConfig())
+    _losses(one, (0.1, 50), (0.7, 20))
+    other.load(one.state())
+    assert other.state() == one.state()
+    assert math.isfinite(one.state()["mean"])

@@ -154,10 +154,10 @@ def test_a_run_cut_off_before_its_metrics_writes_them_when_resumed(capture: Path
     assert (found["gaussians"], found["iterations"]) == (expected["gaussians"], 20)
 
 
-def test_only_the_last_two_checkpoints_are_kept(capture: Path, tmp_path: Path) -> None:
+def test_only_the_last_two_checkpoints_and_the_best_are_kept(capture: Path, tmp_path: Path) -> None:
     run = TrainingRun.create(capture, tmp_path / "run", _config(**{"evaluation.checkpoint_every": 10}))
     list(run)
-    assert sorted(p.name for p in (tmp_path / "run" / "checkpoints").iterdir()) == ["00000050", "00000060"]
+    assert sorted(p.name for p in (tmp_path / "run" / "checkpoints").iterdir()) == ["00000050", "00000060", "best"]
 
 
 def test_warmup_leaves_temporal_modules_untouched_and_the_joint_phase_moves_them(capture: Path, tmp_path: Path) -> None:

@@ -1,0 +1,44 @@
+"""Budget: how many anchors a given memory holds.
+
+Counts what grows with the anchors: rows with their gradients and moments, statistics, and the activations of one
+step in which every child is drawn. An upper bound, so that a scene that may grow at will still fits. Knows nothing
+of why anchors are added.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from graings.config import SceneConfig
+from graings.scene.encoding import encoding_width
+
+FLOAT: Final = 4
+MEGABYTE: Final = 1_000_000
+
+# A parameter comes with its gradient and two moments; two snapshots keep it with its moments twice more.
+COPIES: Final = 4 + 2 * 3
+
+# Means, quaternions, scales, opacity, colour, deformation and residual of one child, and what the rasterizer keeps.
+CHILD_FLOATS: Final = 64
+
+# Values and their gradients.
+BOTH_WAYS: Final = 2
+
+
+def bytes_per_anchor(config: SceneConfig) -> int:
+    """Memory of one more anchor whose children are all drawn."""
+    k = config.children
+    rows = 3 + config.feature_dim + 3 * k + 1
+    statistics = 16 * k + 16
+    # Positions and uids are kept as they are; growth and pruning hold old and new rows at once.
+    fixed = 20 * (1 + COPIES) + statistics * 4
+    static = config.feature_dim + 3 + k + config.static_width
+    deform = encoding_width(3, config.position_frequencies) + config.deform_width * config.deform_depth
+    heads = (config.feature_dim + 3) + 3 * config.head_width + 8 * k
+    activations = BOTH_WAYS * FLOAT * (k * (static + deform + CHILD_FLOATS) + heads)
+    return FLOAT * rows * COPIES + fixed + activations
+
+
+def affordable_anchors(config: SceneConfig, memory_mb: int) -> int:
+    """Anchors that fit into `memory_mb`; at least 16, below which nothing can be seen."""
+    return max(16, memory_mb * MEGABYTE // bytes_per_anchor(config))

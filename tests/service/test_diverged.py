@@ -1,0 +1,61 @@
+"""A job that comes apart, from the upload to the picture, with a real worker."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.settings import Settings
+
+# A rate that grows out of all bounds: the first steps are sound, a few dozen later the numbers run out.
+BLOW_UP = {
+    "iterations": 200,
+    "init.points": 200,
+    "evaluation.first": 2,
+    "rates.deformation": [0.005, 1e30],
+    "guard.patience": 5,
+}
+LONG_S = 120.0
+
+
+def _refuse(constant: str) -> float:
+    raise AssertionError(f"{constant} is not strict JSON")
+
+
+@pytest.mark.slow
+def test_a_job_that_diverges_says_so_and_its_best_model_can_be_looked_at(
+    client: TestClient, archive: bytes, settings: Settings
+) -> None:
+    query = {"preset": "draft", "config": json.dumps(BLOW_UP)}
+    job = client.post("/jobs", params=query, content=archive).json()
+    command = [sys.executable, "-m", "jobs.commands", "--data", str(settings.data), "--threads", "1"]
+    with subprocess.Popen(command) as worker:
+        try:
+            deadline = time.monotonic() + LONG_S
+            while job["state"] in ("queued", "running"):
+                assert time.monotonic() < deadline, "waited in vain"
+                time.sleep(0.2)
+                job = client.get(job["links"]["self"]).json()
+        finally:
+            worker.terminate()
+    assert job["state"] == "diverged"
+    assert "after going back 3 times" in job["error"]
+    assert (job["progress"]["phase"], job["attempts"]) == ("diverged", 1)
+    assert "retry" in job["links"]
+    metrics = json.loads(client.get(job["links"]["metrics"]).text, parse_constant=_refuse)
+    assert metrics["diverged"]
+    assert metrics["splits"]["val"]["psnr"] >= max(point["psnr"] for point in metrics["curve"]) - 1e-9
+    picture = client.get(job["links"]["render"], params={"camera": "val:0"})
+    assert picture.status_code == 200
+    assert picture.headers["content-type"] == "image/png"
+    assert picture.headers["x-graings-iteration"] == str(job["checkpoint"]) == str(metrics["iterations"])
+    assert picture.headers["x-graings-finished"] == "false"
+    events: Any = client.get(job["links"]["events"], headers={"Last-Event-ID": "0"}).text
+    assert events.count("rolled back to iteration") == 3
+    assert "event: end" in events

@@ -1,0 +1,101 @@
+"""A trainer small enough for hundreds of steps in a test, and ways to spoil one of its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.config import TrainConfig, make_config
+from graings.evaluation import evaluate
+from graings.threads import use_threads
+from graings.training import trainer as trainer_module
+from graings.training.trainer import StepReport, Trainer
+
+# Nothing grows or goes unless a test wants it: parameters keep their identity.
+STILL = {"density.grow_from": 30_000, "density.grow_until": 0, "density.prune_from": 30_000, "density.prune_until": 0}
+
+
+def micro_config(**overrides: object) -> TrainConfig:
+    small: dict[str, object] = {
+        "iterations": 200,
+        "threads": 1,
+        "warmup": 3_000,
+        "init.points": 150,
+        "scene.children": 3,
+        "scene.feature_dim": 8,
+        "scene.deform_width": 16,
+        "scene.deform_depth": 2,
+        "density.min_observations": 2,
+        "evaluation.first": 20,
+        "evaluation.views": 2,
+        "guard.snapshot_every": 25,
+        "guard.check_every": 5,
+    }
+    return make_config("draft", small | STILL | overrides)
+
+
+def micro_trainer(capture: Path, **overrides: object) -> Trainer:
+    config = micro_config(**overrides)
+    use_threads(1)
+    data = load_capture(capture, config.capture)
+    images = ImageStore(config.capture.background_rgb(), config.capture.cache_mb)
+    return Trainer(data, images, config)
+
+
+def steps(trainer: Trainer, count: int) -> list[StepReport]:
+    return [trainer.step() for _ in range(count)]
+
+
+def said(reports: list[StepReport], word: str) -> list[str]:
+    """Events that begin with `word`."""
+    return [event for report in reports for event in report.events if event.startswith(word)]
+
+
+def quality(trainer: Trainer) -> float:
+    """PSNR over all training views in dB."""
+    psnr = evaluate(trainer.scene, trainer.capture.train, trainer.images, trainer.background).psnr
+    assert psnr is not None
+    return psnr
+
+
+def finite(trainer: Trainer) -> bool:
+    tensors = [*trainer.scene.parameters(), *trainer.optimizer.state().values()]
+    return all(bool(tensor.isfinite().all()) for tensor in tensors)
+
+
+def spoil_gradient(
+    trainer: Trainer, name: str, when: Callable[[int], bool], change: Callable[[Tensor], Tensor]
+) -> None:
+    """Have `change` make the gradient of parameter `name` in the steps that `when` chooses."""
+    parameter = dict(trainer.scene.named_parameters())[name]
+    parameter.register_hook(lambda gradient: change(gradient.clone()) if when(trainer.iteration) else gradient)
+
+
+def spoil_loss(
+    monkeypatch: pytest.MonkeyPatch, trainer: Trainer, when: Callable[[int], bool], factor: float = float("nan")
+) -> None:
+    """Multiply the photometric loss by `factor` in the steps that `when` chooses."""
+    true = trainer_module.photometric
+
+    def spoiled(image: Tensor, target: Tensor, weight: float) -> Tensor:
+        value = true(image, target, weight)
+        return value * factor if when(trainer.iteration) else value
+
+    monkeypatch.setattr(trainer_module, "photometric", spoiled)
+
+
+def first(values: Tensor, number: float) -> Tensor:
+    """`values` with `number` in place of its first entry."""
+    values.view(-1)[0] = number
+    return values
+
+
+def everywhere(number: float) -> Callable[[Tensor], Tensor]:
+    """Replaces a gradient by one number."""
+    return lambda gradient: torch.full_like(gradient, number)

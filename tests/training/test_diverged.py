@@ -1,0 +1,210 @@
+"""Runs that cannot be saved, and disks that cannot be written: what is left on disk is whole, finite and the best."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from graings import checkpoint
+from graings.checkpoint import best_checkpoint, load_model, newest_checkpoint
+from graings.errors import CheckpointError, DivergedError
+from graings.evaluation import evaluate
+from graings.render import render
+from graings.run_folder import checkpoints
+from graings.training.run import TrainingRun
+from tests.training.micro import micro_config, spoil_loss
+
+LOST_AT = 70
+
+
+def _lost(micro: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, **options: object) -> TrainingRun:
+    """A run that is spoiled for good from step `LOST_AT` on."""
+    run = TrainingRun.create(micro, folder, micro_config(**{"evaluation.checkpoint_every": 30} | options))
+    spoil_loss(monkeypatch, run._trainer, lambda i: i >= LOST_AT)
+    with pytest.raises(DivergedError, match="The best model is kept"):
+        list(run)
+    return run
+
+
+def _document(folder: Path) -> dict[str, Any]:
+    def refuse(constant: str) -> float:
+        raise AssertionError(f"{constant} is not strict JSON")
+
+    document: dict[str, Any] = json.loads((folder / "metrics.json").read_text(), parse_constant=refuse)
+    return document
+
+
+def test_a_run_that_diverges_delivers_its_best_model_and_says_so(
+    micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    run = _lost(micro, folder, monkeypatch)
+    model, document = load_model(folder), _document(folder)
+    assert (document["diverged"], document["rollbacks"]) == (True, 3)
+    assert "3 times: the loss was not finite" in document["diverged_reason"]
+    assert document["iterations"] == model.iteration == run.iteration < LOST_AT
+    assert not model.finished
+    assert all(bool(values.isfinite().all()) for values in model.scene.state_dict().values())
+    view = model.views["val"][0]
+    assert bool(render(model.scene, view.camera, view.time, model.background).color.isfinite().all())
+    psnr = evaluate(model.scene, run.capture.val, run.images, model.background).psnr
+    assert psnr == pytest.approx(document["splits"]["val"]["psnr"])
+    assert psnr >= max(point["psnr"] for point in document["curve"]) - 1e-9
+    # Whoever asks for the newest finds this one, and nothing of what came after it.
+    assert max(int(one.name) for one in checkpoints(folder)) == model.iteration
+    happened = [event["what"].split(":")[0] for event in document["events"]]
+    assert [what for what in happened if what.startswith("rolled back")] == [
+        "rolled back to iteration 50",
+        "rolled back to iteration 25",
+        "rolled back to iteration 25",
+    ]
+    assert happened[-1] == "diverged"
+    assert sum(what == "skipped" for what in happened) >= 9
+
+
+def test_the_best_evaluation_is_delivered_where_the_last_good_moment_was_worse(
+    micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    run = TrainingRun.create(micro, folder, micro_config(**{"guard.rollbacks": 0}))
+    spoil_loss(monkeypatch, run._trainer, lambda i: i >= LOST_AT)
+    steps = iter(run)
+    for report in steps:
+        if report.iteration == 46:
+            break
+    assert best_checkpoint(folder) is not None
+    with torch.no_grad():
+        run._trainer.scene.appearance.color[-1].bias.fill_(-5.0)  # finite, and wrong
+    run._trainer.optimizer.damping = 0.0
+    with pytest.raises(DivergedError):
+        list(steps)
+    assert load_model(folder).iteration == 45
+    assert _document(folder)["splits"]["val"]["psnr"] == pytest.approx(run._best_psnr, abs=1.0)
+
+
+def test_a_run_that_diverges_before_anything_was_measured_delivers_its_beginning(
+    micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tests.training.test_diverged.LOST_AT", 1)
+    _lost(micro, tmp_path / "run", monkeypatch)
+    assert load_model(tmp_path / "run").iteration == 0
+    assert _document(tmp_path / "run")["diverged"]
+
+
+def test_a_diverged_run_can_be_resumed_at_its_low_rates_and_finish(
+    micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    _lost(micro, folder, monkeypatch, iterations=90)
+    monkeypatch.undo()
+    again = TrainingRun.resume(folder, threads=1)
+    assert again._trainer.optimizer.damping == 0.125
+    assert list(again)[-1].iteration == 90
+    document = _document(folder)
+    assert (document["diverged"], document["rollbacks"], document["skipped_steps"]) == (False, 3, 12)
+    assert load_model(folder).finished
+
+
+def test_a_run_with_skipped_steps_resumes_bit_for_bit(
+    micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The guard's counts and norms are part of the checkpoint."""
+    config, found = micro_config(iterations=60), []
+    for name, stop in (("unbroken", 60), ("broken", 32)):
+        run = TrainingRun.create(micro, tmp_path / name, config)
+        spoil_loss(monkeypatch, run._trainer, lambda i: i in (10, 31, 33), factor=float("inf"))
+        for report in run:
+            if report.iteration == stop:
+                break
+        if stop < 60:
+            run.save()
+            monkeypatch.undo()
+            run = TrainingRun.resume(tmp_path / name, threads=1)
+            spoil_loss(monkeypatch, run._trainer, lambda i: i in (10, 31, 33), factor=float("inf"))
+            list(run)
+        monkeypatch.undo()
+        assert run._trainer.guard.skipped == 3
+        found.append((run._trainer.guard.state(), load_model(tmp_path / name).scene.state_dict()))
+    (norms, facts), scene = found[0]
+    assert facts == found[1][0][1]
+    assert all(torch.equal(norms[name], found[1][0][0][name]) for name in norms)
+    assert all(torch.equal(scene[name], found[1][1][name]) for name in scene)
+
+
+def test_a_scene_that_is_not_finite_is_never_saved(micro: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(micro, tmp_path / "run", micro_config(**{"guard.check_every": 1000}))
+    for report in run:
+        if report.iteration == 30:
+            break
+    with torch.no_grad():
+        run._trainer.scene.scaffold.features[0, 0] = float("nan")
+    run.save()
+    model = load_model(tmp_path / "run")
+    assert model.iteration == 30
+    assert all(bool(values.isfinite().all()) for values in model.scene.state_dict().values())
+    assert "rolled back to iteration 25: scaffold.features was not finite" in run._events[-1]["what"]
+
+
+@pytest.mark.parametrize("file", ["scene.safetensors", "state.safetensors"])
+def test_a_full_disk_in_the_middle_of_a_checkpoint_leaves_the_one_before(
+    micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str
+) -> None:
+    """E21, disk full."""
+    folder = tmp_path / "run"
+    run = TrainingRun.create(micro, folder, micro_config(iterations=20))
+    steps = iter(run)
+    next(steps)
+    earlier = run.save()
+    contents = {path.name: path.read_bytes() for path in earlier.iterdir()}
+    next(steps)
+    write = checkpoint.save_file
+
+    def full(tensors: dict[str, torch.Tensor], path: Path) -> None:
+        if path.name == file:
+            path.write_bytes(b"half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(tensors, path)
+
+    monkeypatch.setattr(checkpoint, "save_file", full)
+    with pytest.raises(CheckpointError, match=r"No space left.*earlier ones are kept"):
+        run.save()
+    assert newest_checkpoint(folder) == earlier
+    assert {path.name: path.read_bytes() for path in earlier.iterdir()} == contents
+    assert sorted(path.name for path in earlier.parent.iterdir()) == [earlier.name]
+    del steps
+    assert TrainingRun.resume(folder, threads=1).iteration == 1
+
+
+def test_a_crash_in_the_middle_of_a_checkpoint_leaves_the_one_before(
+    micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """E21, crash: what a killed process leaves is not taken for a checkpoint, and the next save clears it away."""
+
+    class Killed(BaseException):
+        pass
+
+    folder = tmp_path / "run"
+    run = TrainingRun.create(micro, folder, micro_config(iterations=20))
+    steps = iter(run)
+    next(steps)
+    earlier = run.save()
+    next(steps)
+
+    def killed(path: Path) -> None:
+        raise Killed
+
+    monkeypatch.setattr(checkpoint, "_flush", killed)
+    with pytest.raises(Killed):
+        run.save()
+    monkeypatch.undo()
+    assert newest_checkpoint(folder) == earlier
+    del steps
+    again = TrainingRun.resume(folder, threads=1)
+    steps = iter(again)
+    assert next(steps).iteration == 2
+    assert load_model(again.save()).iteration == 2

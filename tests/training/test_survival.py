@@ -1,0 +1,456 @@
+"""Training under fire: the E cases of the numerics matrix, each provoked in a real trainer on a tiny capture.
+
+E15 and E16 are tests of `tests.scene.test_scene` and `tests.training.test_run`, E17 and E21 of `test_run` and
+`test_diverged`. E08 (spread over seeds) needs scenes trained to the end, which no quick test has.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from graings.checkpoint import load_model
+from graings.errors import DivergedError
+from graings.raster.photometric import photometric
+from graings.raster.rasterize import rasterize
+from graings.render import draw, render
+from graings.training.budget import affordable_anchors, bytes_per_anchor
+from graings.training.density import MIN_ANCHORS
+from graings.training.optimizer import Optimizer
+from graings.training.run import TrainingRun
+from graings.training.trainer import Trainer
+from tests.scenes import overlapping
+from tests.training.micro import (
+    everywhere,
+    finite,
+    first,
+    micro_config,
+    micro_trainer,
+    quality,
+    said,
+    spoil_gradient,
+    spoil_loss,
+    steps,
+)
+
+BAD = float("nan")
+BIAS = "appearance.color.2.bias"
+
+
+@pytest.fixture(scope="module")
+def clean(micro: Path) -> float:
+    """Quality of a run that nothing disturbs."""
+    trainer = micro_trainer(micro)
+    steps(trainer, 200)
+    assert (trainer.guard.skipped, trainer.guard.clipped, trainer.guard.rollbacks) == (0, 0, 0)
+    return quality(trainer)
+
+
+@pytest.mark.parametrize("bad", [BAD, float("inf")])
+@pytest.mark.parametrize("name", [BIAS, "scaffold.features", "static.out.weight"])
+def test_a_bad_gradient_is_skipped_before_the_optimiser_sees_it(micro: Path, name: str, bad: float) -> None:
+    """E02, gradient: parameters, moments and statistics are bit for bit what they were."""
+    trainer = micro_trainer(micro)
+    steps(trainer, 10)
+    spoil_gradient(trainer, name, lambda i: i == 11, lambda gradient: first(gradient, bad))
+    before = {key: value.clone() for key, value in trainer.scene.state_dict().items()}
+    moments = {key: value.clone() for key, value in trainer.optimizer.state().items()}
+    events = said(steps(trainer, 1), "skipped")
+    assert len(events) == 1
+    assert name in events[0]
+    assert all(torch.equal(value, before[key]) for key, value in trainer.scene.state_dict().items())
+    assert all(torch.equal(value, moments[key]) for key, value in trainer.optimizer.state().items())
+    steps(trainer, 1)
+    assert any(not torch.equal(value, before[key]) for key, value in trainer.scene.state_dict().items())
+
+
+def test_a_run_with_a_bad_gradient_is_as_good_as_a_clean_one(micro: Path, clean: float) -> None:
+    """E02, gradient at step 50."""
+    trainer = micro_trainer(micro)
+    spoil_gradient(trainer, BIAS, lambda i: i == 50, lambda gradient: first(gradient, BAD))
+    assert len(said(steps(trainer, 200), "skipped")) == 1
+    assert (trainer.guard.skipped, trainer.guard.rollbacks) == (1, 0)
+    assert quality(trainer) > clean - 0.5
+
+
+def test_a_run_with_a_bad_loss_is_as_good_as_a_clean_one(
+    micro: Path, clean: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """E02, loss at step 50."""
+    trainer = micro_trainer(micro)
+    spoil_loss(monkeypatch, trainer, lambda i: i == 50)
+    assert "the loss was not finite" in said(steps(trainer, 200), "skipped")[0]
+    assert quality(trainer) > clean - 0.5
+
+
+@pytest.mark.parametrize("moment", ["exp_avg", "exp_avg_sq"])
+def test_a_bad_moment_is_noticed_and_training_goes_back(micro: Path, moment: str) -> None:
+    """E02, one number of Adam's state at step 52: it reaches the parameter, not the model that is kept.
+
+    Half the rates cost a run this short several decibels; going back must cost none beyond those.
+    """
+    slower = micro_trainer(micro)
+    steps(slower, 50)
+    slower.optimizer.damping = 0.5
+    steps(slower, 150)
+    trainer = micro_trainer(micro)
+    steps(trainer, 52)
+    trainer.optimizer.adam.state[trainer.scene.scaffold.features][moment][3, 2] = BAD
+    events = said(steps(trainer, 3), "rolled back to iteration 50")
+    assert len(events) == 1
+    assert finite(trainer)
+    assert trainer.guard.rollbacks == 1
+    steps(trainer, 145)
+    assert quality(trainer) > quality(slower) - 0.5
+
+
+def test_three_bad_steps_in_a_row_restore_scene_moments_streams_and_statistics(
+    micro: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = micro_trainer(micro, **{"density.statistics_from": 0, "density.grow_until": 20_000})
+    steps(trainer, 25)
+    tensors, facts = trainer.state()
+    good = copy.deepcopy((trainer.scene.state_dict(), tensors, facts))
+    steps(trainer, 3)
+    spoil_loss(monkeypatch, trainer, lambda i: i > 28)
+    reports = steps(trainer, 3)
+    assert len(said(reports, "rolled back to iteration 25: the loss was not finite in 3 steps in a row")) == 1
+    scene, (tensors, facts) = trainer.scene.state_dict(), trainer.state()
+    assert all(torch.equal(scene[name], good[0][name]) for name in good[0])
+    same = [name for name in good[1] if not name.startswith("sampler")]
+    assert any(name.startswith("adam/") for name in same)
+    assert any(name.startswith("statistics/") for name in same)
+    assert all(torch.equal(tensors[name], good[1][name]) for name in same)
+    assert trainer.iteration == 31  # spent iterations stay spent
+    assert trainer.guard.skipped == 3
+    # Half the rates, and views in an order of their own.
+    assert trainer.optimizer.damping == 0.5
+    assert trainer.sampler.generator is trainer.streams["sampler.1"]
+
+
+def test_going_back_in_vain_goes_back_further_and_in_the_end_gives_up(
+    micro: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = micro_trainer(micro)
+    steps(trainer, 60)
+    spoil_loss(monkeypatch, trainer, lambda i: i > 60)
+    reports = [trainer.step() for _ in range(11)]
+    with pytest.raises(DivergedError, match="after going back 3 times: the loss was not finite"):
+        trainer.step()
+    assert [event.split(":")[0] for event in said(reports, "rolled back")] == [
+        "rolled back to iteration 50",
+        "rolled back to iteration 25",
+        "rolled back to iteration 25",
+    ]
+    assert trainer.iteration == 72
+    trainer.restore()
+    assert trainer.iteration == 25
+    assert finite(trainer)
+
+
+def test_a_loss_that_runs_away_with_finite_numbers_goes_back(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = micro_trainer(micro, **{"guard.patience": 20})
+    steps(trainer, 100)
+    spoil_loss(monkeypatch, trainer, lambda i: i > 100, factor=50.0)
+    events = said(steps(trainer, 60), "rolled back to iteration 100: the mean loss was")
+    assert events  # and not to a moment taken when the loss was already running away
+
+
+def test_a_hundredfold_rate_ends_converged_or_diverged_with_a_model_that_renders(micro: Path, tmp_path: Path) -> None:
+    """E01: 500 iterations."""
+    rates = {
+        f"rates.{name}": [100 * value for value in pair] for name, pair in micro_config().rates.model_dump().items()
+    }
+    config = micro_config(iterations=500, **rates, **{"guard.patience": 50})
+    diverged = False
+    try:
+        for report in TrainingRun.create(micro, tmp_path / "run", config):
+            assert report.evaluation is None or math.isfinite(report.evaluation.psnr)
+    except DivergedError:
+        diverged = True
+    model = load_model(tmp_path / "run")
+    assert all(bool(tensor.isfinite().all()) for tensor in model.scene.state_dict().values())
+    view = model.views["val"][0]
+    assert bool(render(model.scene, view.camera, view.time, model.background).color.isfinite().all())
+    assert model.finished is not diverged
+
+
+def test_a_finite_spike_is_limited_and_does_not_freeze_its_parameter(micro: Path) -> None:
+    """E03: 1e10 in one entry; the updates of that entry afterwards against those of its undisturbed neighbour."""
+    trainer = micro_trainer(micro, iterations=300)
+    # Where all gradients are the same, the normal size of an update is the rate.
+    spoil_gradient(trainer, BIAS, lambda i: i != 60, everywhere(0.01))
+    spoil_gradient(trainer, BIAS, lambda i: i == 60, lambda gradient: first(everywhere(0.01)(gradient), 1e10))
+    steps(trainer, 59)
+    assert len(said(steps(trainer, 1), "clipped: gradients of color at 1e+10")) == 1
+    values = dict(trainer.scene.named_parameters())[BIAS]
+    ratios = []
+    for iteration in range(61, 261):
+        before = values.detach().clone()
+        trainer.step()
+        moved = (values.detach() - before).abs()
+        ratios.append(float(moved[0]) / trainer.optimizer.rate("color", iteration))
+        assert float(moved[1]) >= 0.2 * trainer.optimizer.rate("color", iteration)
+    assert min(ratios) >= 0.2
+
+
+@pytest.mark.parametrize(("number", "drift"), [(0.0, 0.0), (1e-25, 1e-8)])
+def test_gradients_that_are_nothing_or_almost_move_nothing(micro: Path, number: float, drift: float) -> None:
+    """E04: 100 steps."""
+    trainer = micro_trainer(micro)
+    before = {name: value.detach().clone() for name, value in trainer.scene.named_parameters()}
+    for name in before:
+        spoil_gradient(trainer, name, lambda _: True, everywhere(number))
+    assert said(steps(trainer, 100), "") == []
+    assert finite(trainer)
+    for name, value in trainer.scene.named_parameters():
+        assert float((value.detach() - before[name]).abs().max()) <= drift, name
+
+
+def _peak_bytes() -> int:
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM")))
+
+
+def test_growth_without_end_stops_at_the_budget(micro: Path) -> None:
+    """E05: everything grows on six levels; the budget is that of the memory, and the memory is not exceeded."""
+    memory_mb = 4
+    trainer = micro_trainer(
+        micro,
+        **{
+            "density.gradient_threshold": 1e-30,
+            "density.levels": 6,
+            "density.grow_from": 0,
+            "density.grow_until": 30_000,
+            "density.grow_every": 5,
+            "density.min_observations": 0,
+            "density.statistics_from": 0,
+            "density.memory_mb": memory_mb,
+        },
+    )
+    most = affordable_anchors(trainer.config.scene, memory_mb)
+    assert trainer.scene.scaffold.count < most < trainer.config.density.max_anchors
+    steps(trainer, 2)
+    Path("/proc/self/clear_refs").write_text("5")  # the peak is counted from here on
+    start = _peak_bytes()
+    reports = steps(trainer, 48)
+    assert trainer.scene.scaffold.count == most
+    assert said(reports, "growth_capped")
+    assert _peak_bytes() - start < memory_mb * 1_000_000
+    assert finite(trainer)
+
+
+def test_a_larger_scene_costs_more_of_the_budget() -> None:
+    small, large = micro_config().scene, micro_config(**{"scene.children": 10, "scene.deform_width": 256}).scene
+    assert bytes_per_anchor(large) > 3 * bytes_per_anchor(small)
+    assert affordable_anchors(large, 1) >= 16
+
+
+def test_pruning_everything_leaves_a_scene_to_train(micro: Path) -> None:
+    """E06."""
+    trainer = micro_trainer(
+        micro,
+        **{
+            "density.prune_from": 0,
+            "density.prune_until": 30_000,
+            "density.prune_every": 300,
+            "density.prune_opacity": 1e9,
+            "density.prune_visits": 1,
+            "density.statistics_from": 0,
+        },
+    )
+    start = trainer.scene.scaffold.count
+    steps(trainer, 40)
+    assert trainer.scene.scaffold.count >= min(MIN_ANCHORS, start)
+    before = quality(trainer)
+    steps(trainer, 60)
+    assert quality(trainer) > before
+
+
+def _losses(trainer: Trainer, dtype: torch.dtype, count: int) -> list[float]:
+    """Losses of plain training in one precision, views in order."""
+    scene = copy.deepcopy(trainer.scene).to(dtype)
+    scene.temporal = True
+    optimizer = Optimizer(scene, trainer.config, joint_from=0)
+    found = []
+    for iteration in range(1, count + 1):
+        frame = trainer.capture.train[iteration % len(trainer.capture.train)]
+        target = torch.from_numpy(trainer.images.rgb(frame)).to(dtype)
+        drawn = draw(scene.compose(frame.camera.center, frame.time), frame.camera, trainer.background)
+        loss = photometric(drawn.color, target, 0.2)
+        loss.backward()
+        optimizer.step(iteration)
+        found.append(float(loss.detach()))
+    return found
+
+
+def test_single_and_double_precision_learn_alike(micro: Path) -> None:
+    """E07: 50 iterations without growth; losses and not parameters, whose paths are chaotic."""
+    trainer = micro_trainer(micro)
+    single, double = (_losses(trainer, dtype, 50) for dtype in (torch.float32, torch.float64))
+    assert single[-1] < 0.7 * single[0]
+    assert max(abs(a - b) / b for a, b in zip(single, double, strict=True)) < 1e-2
+    assert abs(single[0] - double[0]) / double[0] < 1e-5
+
+
+@pytest.mark.parametrize("projected", [True, False])
+@pytest.mark.parametrize("bias", [3.0, -3.0])
+def test_a_log_scale_beyond_its_clip_comes_back(micro: Path, bias: float, projected: bool) -> None:
+    """E09: by the image where the gradient is projected, by the regulariser alone where it is not."""
+    options = {"scene.projected_clip": projected, "rates.deformation": [0.005, 0.005], "loss.deformation": 0.01}
+    trainer = micro_trainer(micro, iterations=400, warmup=0, **options)
+    steps(trainer, 30)
+    assert trainer.scene.deformation is not None
+    with torch.no_grad():
+        trainer.scene.deformation.out.bias[7:] = bias
+    steps(trainer, 200)
+    frame = trainer.capture.train[0]
+    moved = trainer.scene.compose(frame.camera.center, frame.time).deformation
+    assert moved is not None
+    assert float(moved.log_scales.detach().abs().median()) < 2.0
+
+
+def _drive(trainer: Trainer, layer: nn.Module, bias: float) -> None:
+    assert isinstance(layer, nn.Linear)
+    with torch.no_grad():
+        layer.bias.fill_(bias)
+
+
+@pytest.mark.parametrize("bias", [20.0, -20.0])
+def test_saturated_colours_come_back(micro: Path, bias: float) -> None:
+    """E10: logits at 20 give a gradient of exactly 0 where it is formed from the value."""
+    trainer = micro_trainer(micro, **{"rates.color": [0.1, 0.1]})
+    last = trainer.scene.appearance.color[-1]
+    assert isinstance(last, nn.Linear)
+    _drive(trainer, last, bias)
+    before = quality(trainer)
+    steps(trainer, 200)
+    assert float(last.bias.detach().abs().min()) < 19.0
+    assert quality(trainer) > before
+
+
+def test_a_saturated_opacity_has_a_gradient_and_falls_where_the_data_want_it(micro: Path) -> None:
+    """E11: at 20 the gradient is there; from 12 on it is large enough for Adam's epsilon."""
+    trainer = micro_trainer(micro, **{"rates.opacity": [0.05, 0.05]})
+    last = trainer.scene.appearance.opacity[-1]
+    assert isinstance(last, nn.Linear)
+    _drive(trainer, last, 20.0)
+    frame = trainer.capture.train[0]
+    drawn = draw(trainer.scene.compose(frame.camera.center, frame.time), frame.camera, trainer.background)
+    drawn.alpha.sum().backward()
+    assert last.bias.grad is not None
+    assert float(last.bias.grad.max()) > 0
+    last.bias.grad = None
+    trainer.optimizer.clear()
+    _drive(trainer, last, 12.0)
+    before = quality(trainer)
+    steps(trainer, 200)
+    assert float(last.bias.detach().min()) < 11.0
+    assert quality(trainer) > before
+
+
+def test_a_scene_in_which_all_is_hidden_is_shown_again_once_and_then_goes_back(micro: Path) -> None:
+    """E12."""
+    trainer = micro_trainer(micro)
+    last = trainer.scene.appearance.opacity[-1]
+    assert isinstance(last, nn.Linear)
+    _drive(trainer, last, -3.0)
+    before = quality(trainer)
+    reports = steps(trainer, 6)
+    assert [report.gaussians for report in reports] == [0] * 6
+    assert len(said(reports, "opacity_rebias")) == 1
+    assert trainer.step().gaussians > 0
+    assert said(steps(trainer, 120), "opacity_rebias") == []
+    assert quality(trainer) > before + 3
+    _drive(trainer, trainer.scene.appearance.opacity[-1], -3.0)
+    again = steps(trainer, 20)
+    assert said(again, "opacity_rebias") == []
+    assert len(said(again, "rolled back to iteration 125: nothing was drawn any more")) == 1
+
+
+def test_a_rotation_at_the_zero_quaternion_is_finite_and_leaves_it(micro: Path) -> None:
+    """E13: the residual that cancels the identity, then noise in its place."""
+    trainer = micro_trainer(micro, warmup=0)
+    assert trainer.scene.deformation is not None
+    bias = trainer.scene.deformation.out.bias
+    with torch.no_grad():
+        bias[3] = -1.0
+    noise = torch.Generator().manual_seed(0)
+    frame = trainer.capture.train[0]
+    for _ in range(150):
+        trainer.step()
+        with torch.no_grad():
+            bias[3:7] += 0.01 * torch.randn(4, generator=noise)
+    assert finite(trainer)
+    assert trainer.guard.rollbacks == 0
+    composition = trainer.scene.compose(frame.camera.center, frame.time)
+    length = composition.gaussians.quats.detach().norm(dim=-1)
+    assert bool(((length > 0.01) & (length < 10)).all())
+    assert draw(composition, frame.camera, trainer.background).culled["zero_quat"] == 0
+
+
+def test_a_quaternion_and_its_negative_draw_the_same_bits() -> None:
+    """E14."""
+    batch, camera = overlapping()
+    white = torch.ones(3, dtype=torch.float64)
+    pictures = [rasterize(replace(batch, quats=sign * batch.quats), camera, white).color for sign in (1, -1)]
+    assert torch.equal(*pictures)
+
+
+GROWING = {
+    "density.statistics_from": 0,
+    "density.grow_from": 3_000,
+    "density.grow_until": 15_000,
+    "density.grow_every": 20,
+}
+
+
+def test_children_born_in_one_place_part(micro: Path) -> None:
+    """E18: 100 iterations after the birth of anchors with zero offsets, of which some view has seen something."""
+    trainer = micro_trainer(micro, **GROWING)
+    old = trainer.next_uid
+    assert said(steps(trainer, 100), "grew")
+    steps(trainer, 100)
+    moments = trainer.optimizer.adam.state[trainer.scene.scaffold.offsets]["exp_avg_sq"]
+    born = (trainer.scene.scaffold.uids >= old) & (moments > 0).flatten(1).all(1)
+    assert bool(born.any())
+    offsets = trainer.scene.scaffold.offsets.detach()[born]
+    apart = torch.cdist(offsets, offsets) + torch.eye(offsets.shape[1])
+    assert float(apart.min()) > 0
+
+
+def test_growing_does_not_tear_the_picture(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """E19: quality right before and right after each growth."""
+    trainer = micro_trainer(micro, **GROWING, **{"density.newborn_opacity": 0.02})
+    drops: list[float] = []
+    grow = trainer._grow
+
+    def measured() -> list[str]:
+        before = quality(trainer)
+        events = grow()
+        if events:
+            drops.append(before - quality(trainer))
+        return events
+
+    monkeypatch.setattr(trainer, "_grow", measured)
+    steps(trainer, 110)
+    assert drops
+    assert max(drops) <= 0.5
+
+
+def test_a_saved_scene_draws_the_bits_that_it_drew_before(micro: Path, tmp_path: Path) -> None:
+    """E20, float32."""
+    run = TrainingRun.create(micro, tmp_path / "run", micro_config(iterations=30))
+    list(run)
+    model = load_model(tmp_path / "run")
+    frame = run.capture.train[2]
+    pictures = [
+        render(scene, frame.camera, frame.time, model.background).color for scene in (run._trainer.scene, model.scene)
+    ]
+    assert torch.equal(*pictures)
