@@ -194,7 +194,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         app(args=arguments, prog_name="graings")
     except (GraingsError, OSError) as error:
-        _fail(str(error), next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1))
+        _fail(_words(error), next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1))
+
+
+def _words(error: Exception) -> str:
+    """What happened to which file, and what to do, instead of the system's number for it."""
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return f"{error.filename}: is a file where a folder is wanted. Name another place."
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}."
+    return str(error)
 
 
 def _joined(entry: EntryPoint) -> Any:

@@ -15,44 +15,30 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 
-class _Tanh(torch.autograd.Function):
+class _Saturating(torch.autograd.Function):
+    """The derivative of a sigmoid stretched by `stretch` in both directions: stretch^2 E / (1 + E)^2."""
+
     @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, values: Tensor, stretch: float) -> Tensor:
         ctx.save_for_backward(x)
-        return torch.tanh(x)
+        ctx.stretch = stretch
+        return values
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
-        return 4.0 * grad_outputs[0] * _hill(2.0 * x)
-
-
-class _Sigmoid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        ctx.save_for_backward(x)
-        return torch.sigmoid(x)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return grad_outputs[0] * _hill(x)
+        tail = (ctx.stretch * x).abs_().neg_().exp_()
+        return ctx.stretch**2 * grad_outputs[0] * (tail / (1.0 + tail).square_()), None, None
 
 
 def tanh(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Hyperbolic tangent; its derivative is 4 E / (1 + E)^2 with E = exp(-2 |x|)."""
-    result: Tensor = _Tanh.apply(x)  # type: ignore[no-untyped-call]
+    result: Tensor = _Saturating.apply(x, torch.tanh(x.detach()), 2.0)  # type: ignore[no-untyped-call]
     return result
 
 
 def sigmoid(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """1 / (1 + exp(-x)); its derivative is E / (1 + E)^2 with E = exp(-|x|)."""
-    result: Tensor = _Sigmoid.apply(x)  # type: ignore[no-untyped-call]
+    result: Tensor = _Saturating.apply(x, torch.sigmoid(x.detach()), 1.0)  # type: ignore[no-untyped-call]
     return result
-
-
-def _hill(x: Tensor) -> Tensor:
-    tail = x.abs().neg_().exp_()
-    return tail / (1.0 + tail).square_()

@@ -1,0 +1,131 @@
+// Eight rows of a table become columns of float64, one vector each, and columns become rows: of plain arrays and of
+// records. Knows nothing of what the numbers mean.
+#pragma once
+#include "simd.hpp"
+#include "types.hpp"
+
+namespace graings::GRAINGS_ISA {
+
+constexpr int kGroup = 8;
+using D = Vec<double, kGroup>;
+
+#if defined(__AVX512F__)
+// Where number k of eight rows of W lies among their columns, each of eight numbers, or the other way round.
+template <int W, bool ToRows>
+struct Places {
+    alignas(64) int32_t at[(8 * W + 15) / 16 * 16] = {};
+    constexpr Places() {
+        for (int k = 0; k < 8 * W; k++) at[k] = ToRows ? k % W * 8 + k / W : k % 8 * W + k / 8;
+    }
+};
+// The numbers of up to two registers in another order, in the `part`-th register.
+template <int W, bool ToRows>
+GRAINGS_INLINE __m512 reordered(__m512 a, __m512 b, int part) {
+    static constexpr Places<W, ToRows> places;
+    const __m512i at = _mm512_load_si512(places.at + 16 * part);
+    return 8 * W > 16 ? _mm512_permutex2var_ps(a, at, b) : _mm512_permutexvar_ps(at, a);
+}
+#endif
+
+// The columns of a row-major [N, W] array for Gaussians begin..begin+7; past the end the last one repeats.
+template <int W, class R>
+GRAINGS_INLINE void columns_of(const R* rows, int64_t begin, int64_t count, D* columns) {
+    if constexpr (W == 1)
+        if (begin + kGroup <= count) {
+            columns[0] = load_as<kGroup>(rows + begin);
+            return;
+        }
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4)
+        if (begin + kGroup <= count) {
+            constexpr int second = 8 * W - 16;
+            const float* p = rows + begin * W;
+            const __m512 a = W == 1 ? _mm512_castps256_ps512(_mm256_loadu_ps(p)) : _mm512_loadu_ps(p);
+            const __m512 b = second <= 0 ? a : second == 8 ? _mm512_castps256_ps512(_mm256_loadu_ps(p + 16)) : _mm512_loadu_ps(p + 16);
+            for (int part = 0; part < (W + 1) / 2; part++) {
+                const __m512 pair = W == 1 ? a : reordered<W, false>(a, b, part);
+                columns[2 * part].v = (Native<double>)_mm512_cvtps_pd(_mm512_castps512_ps256(pair));
+                if (2 * part + 1 < W) columns[2 * part + 1].v = (Native<double>)_mm512_cvtps_pd(_mm512_extractf32x8_ps(pair, 1));
+            }
+            return;
+        }
+#endif
+    R lanes[W][kGroup];
+    for (int i = 0; i < kGroup; i++) {
+        const R* row = rows + (begin + i < count ? begin + i : count - 1) * W;
+        for (int c = 0; c < W; c++) lanes[c][i] = row[c];
+    }
+    for (int c = 0; c < W; c++) columns[c] = load_as<kGroup>(lanes[c]);
+}
+
+// The way back, rounded to R, for those before the end.
+template <int W, class R>
+GRAINGS_INLINE void store_columns(R* rows, int64_t begin, int64_t end, const D* columns) {
+    if constexpr (W == 1)
+        if (begin + kGroup <= end) {
+            store_as<R>(rows + begin, columns[0]);
+            return;
+        }
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4)
+        if (begin + kGroup <= end) {
+            const auto two = [&](int c) {
+                const __m256 low = _mm512_cvtpd_ps((__m512d)columns[c].v), high = c + 1 < W ? _mm512_cvtpd_ps((__m512d)columns[c + 1 < W ? c + 1 : c].v) : low;
+                return _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1);
+            };
+            const __m512 a = two(0), b = W > 2 ? two(2) : a;
+            for (int part = 0; part < (W + 1) / 2; part++) {
+                const __m512 ordered = W == 1 ? a : reordered<W, true>(a, b, part);
+                float* p = rows + begin * W + 16 * part;
+                if (8 * W - 16 * part >= 16) _mm512_storeu_ps(p, ordered);
+                else _mm256_storeu_ps(p, _mm512_castps512_ps256(ordered));
+            }
+            return;
+        }
+#endif
+    R lanes[W][kGroup];
+    for (int c = 0; c < W; c++) store_as<R>(lanes[c], columns[c]);
+    for (int i = 0; i < kGroup && begin + i < end; i++)
+        for (int c = 0; c < W; c++) rows[(begin + i) * W + c] = lanes[c][i];
+}
+
+#if defined(__AVX512F__)
+// Eight records from their columns: numbers of float64, and pairs of single precision that fill as much.
+GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*pairs)[2]) {
+    __m512d column[8];
+    for (int c = 0; c < 3; c++) column[c] = (__m512d)whole[c].v;
+    const __m512i alternate = _mm512_setr_epi32(0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15);
+    for (int c = 3; c < 8; c++) {
+        const __m256 low = _mm512_cvtpd_ps((__m512d)pairs[c - 3][0].v), high = _mm512_cvtpd_ps((__m512d)pairs[c - 3][1].v);
+        column[c] = _mm512_castps_pd(_mm512_permutexvar_ps(alternate, _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1)));
+    }
+    for (int odd = 0; odd < 2; odd++) {
+        __m512d two[4];  // columns 2k, 2k + 1 of rows 2m + odd, in quarter m
+        for (int k = 0; k < 4; k++) two[k] = odd ? _mm512_unpackhi_pd(column[2 * k], column[2 * k + 1]) : _mm512_unpacklo_pd(column[2 * k], column[2 * k + 1]);
+        const __m512d a = _mm512_shuffle_f64x2(two[0], two[1], 0x44), b = _mm512_shuffle_f64x2(two[2], two[3], 0x44);
+        const __m512d c = _mm512_shuffle_f64x2(two[0], two[1], 0xEE), d = _mm512_shuffle_f64x2(two[2], two[3], 0xEE);
+        _mm512_storeu_pd(to + odd, _mm512_shuffle_f64x2(a, b, 0x88)), _mm512_storeu_pd(to + 2 + odd, _mm512_shuffle_f64x2(a, b, 0xDD));
+        _mm512_storeu_pd(to + 4 + odd, _mm512_shuffle_f64x2(c, d, 0x88)), _mm512_storeu_pd(to + 6 + odd, _mm512_shuffle_f64x2(c, d, 0xDD));
+    }
+}
+#endif
+
+// Records of Gaussians begin..begin+7, as far as they come before the end.
+template <class R>
+GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, const D* whole, const D (*pairs)[2]) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4)
+        if (begin + kGroup <= end) {
+            store_records(records + begin, whole, pairs);
+            return;
+        }
+#endif
+    double x[3][kGroup];
+    R y[10][kGroup];
+    for (int c = 0; c < 3; c++) store(x[c], whole[c]);
+    for (int c = 0; c < 10; c++) store_as<R>(y[c], pairs[c / 2][c % 2]);
+    for (int i = 0; i < kGroup && begin + i < end; i++)
+        records[begin + i] = {x[0][i], x[1][i], x[2][i], {y[0][i], y[1][i], y[2][i], y[3][i], y[4][i], y[5][i], y[6][i], y[7][i], y[8][i], y[9][i]}};
+}
+
+}  // namespace graings::GRAINGS_ISA
