@@ -19,6 +19,7 @@ import torch
 from graings import kernel
 from graings.raster.photometric import photometric
 from graings.render import draw
+from graings.training.guard import Gradient
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 
@@ -66,7 +67,8 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
         [*grads[:-1], *([torch.ones(())] if regulariser.requires_grad else [])],
     )
     watch.lap("scene backward")
-    trainer.guard.passes(regulariser.detach(), trainer.scene.named_parameters())
+    gradients = [*trainer.optimizer.gradients(), Gradient("the projected centres", "screen", grads[-1])]
+    trainer.guard.judge(trainer.iteration, regulariser.detach(), gradients)
     watch.lap("guard")
     size = (frame.camera.width, frame.camera.height)
     visible = result.radii.amax(-1) > 0

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
@@ -142,9 +141,9 @@ def load_model(path: Path) -> Model:
     facts = _read_facts(folder)
     try:
         config = restored(TrainConfig, facts["config"], folder)
-        scene = _scene_from(
-            load_file(folder / _SCENE_FILE), restored(SceneConfig, facts["scene_config"], folder), facts["temporal"]
-        )
+        # Where the checkpoint does not say how time enters, it is older than the other way.
+        shape = restored(SceneConfig, {"deform_time": "input"} | facts["scene_config"], folder)
+        scene = _scene_from(load_file(folder / _SCENE_FILE), shape, facts["temporal"])
         units = facts["units"]
         return Model(
             scene=scene,
@@ -195,9 +194,7 @@ def _read_facts(folder: Path) -> dict[str, Any]:
 
 def _scene_from(tensors: dict[str, Tensor], config: SceneConfig, temporal: bool) -> Scene:
     rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
-    # Weights are overwritten at once; the global random stream is left as it was.
-    with torch.random.fork_rng(devices=[]):
-        scene = Scene(config, Scaffold(**rows), extent=float(tensors["extent"]), initial_opacity=0.1)
+    scene = Scene(config, Scaffold(**rows), extent=float(tensors["extent"]), initial_opacity=0.1)
     scene.load_state_dict(tensors)
     scene.temporal = temporal
     return scene

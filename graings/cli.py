@@ -200,7 +200,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _words(error: Exception) -> str:
     """What happened to which file, and what to do, instead of the system's number for it."""
     if isinstance(error, FileExistsError | NotADirectoryError):
-        return f"{error.filename}: is a file where a folder is wanted. Name another place."
+        place = Path(str(error.filename))
+        taken = next((one for one in (place, *place.parents) if one.is_file()), place)
+        return f"{taken}: is a file where a folder is wanted. Name another place."
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}."
     return str(error)

@@ -57,6 +57,11 @@ class SceneConfig(Part):
     deform_width: int = Field(64, ge=4, le=1024, description="Hidden width of DeformNet.")
     deform_depth: int = Field(4, ge=1, le=12, description="Hidden layers of DeformNet.")
     position_frequencies: int = Field(8, ge=0, le=16, description="Octaves of the position encoding in DeformNet.")
+    deform_time: Literal["product", "input"] = Field(
+        "product",
+        description="How time enters DeformNet. product: motions of a position, each weighed by a function of time; "
+        "input: one network of position and time.",
+    )
     time_frequencies: int = Field(6, ge=0, le=16, description="Octaves of the time encoding (L).")
     residual_scale: float = Field(0.1, ge=0, le=1, description="Bound of the appearance residual (eta).")
     deformation: Literal["child", "anchor", "none"] = Field(

@@ -199,15 +199,16 @@ def test_a_mistake_is_one_clear_message_with_its_exit_code(
 
 
 @pytest.mark.parametrize("verb", [["train", "CAPTURE"], ["ablate", "CAPTURE"], ["report", "RUN"]])
+@pytest.mark.parametrize("below", ["", "below"])
 def test_a_file_where_a_folder_is_wanted_is_named_and_left_alone(
-    capture: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: list[str]
+    capture: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: list[str], below: str
 ) -> None:
     taken = tmp_path / "taken"
     taken.write_text("mine")
     places = {"CAPTURE": capture, "RUN": run}
-    assert graings(*(places.get(word, word) for word in verb), "-o", taken) != 0
+    assert graings(*(places.get(word, word) for word in verb), "-o", taken / below) != 0
     message = capsys.readouterr().err
-    assert str(taken) in message
+    assert f"{taken}: " in message
     assert "Errno" not in message
     assert taken.read_text() == "mine"
 

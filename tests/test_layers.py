@@ -24,11 +24,12 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.gaussians": (),
     "graings.units": ("graings.camera",),
     "graings.config": ("graings.errors",),
+    "graings.seeds": (),
     # Three siblings, strangers to each other.
     "graings.capture": ("graings.capture", "graings.camera", "graings.units", "graings.config", "graings.errors"),
     "graings.scene": (
         *("graings.scene", "graings.camera", "graings.gaussians", "graings.config", "graings.constants"),
-        "graings.kernel",
+        *("graings.kernel", "graings.seeds"),
     ),
     "graings.raster": (
         *("graings.raster", "graings.camera", "graings.gaussians", "graings.constants", "graings.errors"),
@@ -70,7 +71,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.camera", "graings.checkpoint", "graings.config", "graings.constants", "graings.errors"),
         *("graings.evaluation", "graings.machine", "graings.metrics", "graings.plan", "graings.report"),
         *("graings.gaussians", "graings.run_folder", "graings.units", "graings.threads"),
-        *("graings.report_folder", "graings.work_precision"),
+        *("graings.report_folder", "graings.seeds", "graings.work_precision"),
     ),
     # Many runs. The table and its drawing know numbers, not runs.
     "graings.ablation": (),

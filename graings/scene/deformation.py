@@ -18,6 +18,9 @@ from graings.scene.canonical import INITIAL_SCALE
 from graings.scene.encoding import encoding_width, frequency_encoding
 from graings.scene.perceptron import perceptron, weights_and_biases
 
+# Hidden width of psi. It runs once a frame.
+TIME_WIDTH = 64
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deformation:
@@ -40,7 +43,9 @@ def deformation_from(raw: Float[Tensor, "gaussian 10"], extent: float) -> Deform
 class DeformationNetwork(nn.Module):
     """(position, gamma(t)) -> raw offsets [N, 10]; exactly zero at birth.
 
-    Time enters the first layer as a bias: one small product per frame instead of a wider input per Gaussian.
+    With `deform_time` product it is W (phi(x) * psi(gamma(t))) + b: the hidden layers say which of `deform_width`
+    motions a position takes part in, psi how far each has gone. All positions of a frame share psi, so it costs one
+    row. With `deform_time` input the encoded time is a further input of the first layer, as a bias for the same reason.
     """
 
     def __init__(self, config: SceneConfig) -> None:
@@ -49,25 +54,37 @@ class DeformationNetwork(nn.Module):
         self.time_frequencies = config.time_frequencies
         width = config.deform_width
         self.from_position = nn.Linear(encoding_width(3, config.position_frequencies), width)
-        self.from_time = nn.Linear(encoding_width(1, config.time_frequencies), width, bias=False)
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(config.deform_depth - 1))
         self.out = nn.Linear(width, 10)
+        self.from_time, self.psi = time_modules(config)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
     def forward(self, positions: Float[Tensor, "gaussian 3"], time: Float[Tensor, 1]) -> Float[Tensor, "gaussian 10"]:
         """`positions` in units of the scene's extent, `time` in [0, 1]."""
         encoded = frequency_encoding(positions, self.position_frequencies)
-        bias = self.from_position.bias + self.from_time(frequency_encoding(time, self.time_frequencies))
-        rest = weights_and_biases([*self.hidden, self.out])
-        return perceptron(encoded, [self.from_position.weight, *rest[0]], [bias, *rest[1]])
+        moment = frequency_encoding(time, self.time_frequencies)
+        weights, biases = weights_and_biases([self.from_position, *self.hidden, self.out])
+        if self.from_time is not None:
+            biases[0] = biases[0] + self.from_time(moment)
+        if self.psi is not None:
+            weights[-1] = weights[-1] * self.psi(moment)
+        return perceptron(encoded, weights, biases)
+
+
+def time_modules(config: SceneConfig) -> tuple[nn.Linear | None, nn.Sequential | None]:
+    """What encoded time goes through: to the first layer as a bias, or to the last one as weights; one of the two."""
+    width, time_width = config.deform_width, encoding_width(1, config.time_frequencies)
+    if config.deform_time == "input":
+        return nn.Linear(time_width, width, bias=False), None
+    return None, nn.Sequential(nn.Linear(time_width, TIME_WIDTH), nn.ReLU(), nn.Linear(TIME_WIDTH, width))
 
 
 class SingleMLP(nn.Module):
     """Ablation `single_mlp`: one network for canonical and temporal geometry.
 
     (f_a, eps_j, e_j, position, gamma(t)) -> [N, 17]: 7 canonical outputs as StaticMLP's, 10 as
-    DeformationNetwork's. Without a time (`time` None, warm-up) the time input is absent.
+    DeformationNetwork's, into which time enters as there. Without a time (`time` None, warm-up) it does not.
     """
 
     def __init__(self, config: SceneConfig) -> None:
@@ -79,7 +96,7 @@ class SingleMLP(nn.Module):
         self.from_offset = nn.Linear(3, width, bias=False)
         self.child_bias = nn.Parameter(torch.randn(config.children, width) * 0.1)
         self.from_position = nn.Linear(encoding_width(3, config.position_frequencies), width, bias=False)
-        self.from_time = nn.Linear(encoding_width(1, config.time_frequencies), width, bias=False)
+        self.from_time, self.psi = time_modules(config)
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(config.deform_depth - 1))
         self.out = nn.Linear(width, 17)
         with torch.no_grad():
@@ -92,10 +109,14 @@ class SingleMLP(nn.Module):
         self, inputs: Float[Tensor, "gaussian width"], positions: Float[Tensor, "gaussian 3"], time: Tensor | None
     ) -> Float[Tensor, "gaussian 17"]:
         """Raw outputs of the drawn children: `Children.inputs`, and the rest as in DeformationNetwork."""
-        weights = [self.from_feature.weight, self.from_offset.weight, self.child_bias.t(), self.from_position.weight]
+        first = [self.from_feature.weight, self.from_offset.weight, self.child_bias.t(), self.from_position.weight]
         everything = [inputs, frequency_encoding(positions, self.position_frequencies)]
-        bias = self.from_feature.bias
-        if time is not None:
-            bias = bias + self.from_time(frequency_encoding(time, self.time_frequencies))
-        rest = weights_and_biases([*self.hidden, self.out])
-        return perceptron(torch.cat(everything, dim=1), [torch.cat(weights, dim=1), *rest[0]], [bias, *rest[1]])
+        weights, biases = weights_and_biases([*self.hidden, self.out])
+        weights, biases = [torch.cat(first, dim=1), *weights], [self.from_feature.bias, *biases]
+        moment = None if time is None else frequency_encoding(time, self.time_frequencies)
+        if moment is not None and self.from_time is not None:
+            biases[0] = biases[0] + self.from_time(moment)
+        if moment is not None and self.psi is not None:
+            canonical, temporal = weights[-1].split([7, 10])
+            weights[-1] = torch.cat([canonical, temporal * self.psi(moment)])
+        return perceptron(torch.cat(everything, dim=1), weights, biases)

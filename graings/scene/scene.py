@@ -25,6 +25,7 @@ from graings.scene.clip import clip
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP, deformation_from
 from graings.scene.saturate import tanh
 from graings.scene.scaffold import Scaffold
+from graings.seeds import global_stream
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,27 +43,39 @@ class Composition:
 class Scene(nn.Module):
     """The model. `temporal` off (static warm-up, or a single instant) leaves the time modules unevaluated.
 
-    `extent` is the half-size of the content in normalised units; positions enter the networks divided by it.
+    `extent` is the half-size of the content in normalised units; positions enter the networks divided by it. `seed` is
+    that of the networks' first weights.
     """
 
     extent: Tensor
 
-    def __init__(self, config: SceneConfig, scaffold: Scaffold, *, extent: float, initial_opacity: float) -> None:
+    def __init__(
+        self, config: SceneConfig, scaffold: Scaffold, *, extent: float, initial_opacity: float, seed: int = 0
+    ) -> None:
         super().__init__()
         self.config = config
         self.scaffold = scaffold
         self.register_buffer("extent", torch.tensor(float(extent), dtype=scaffold.features.dtype))
         self.temporal = False
-        self.appearance = CanonicalAppearance(config, initial_opacity)
-        self.residual = ResidualField(config) if config.residual else None
+        self.residual: ResidualField | None = None
         self.single: SingleMLP | None = None
         self.static: StaticMLP | None = None
         self.deformation: DeformationNetwork | None = None
+        # Each network begins with the same weights whichever others there are: ablations differ by their part alone.
+        with global_stream(seed, "init.appearance"):
+            self.appearance = CanonicalAppearance(config, initial_opacity)
+        if config.residual:
+            with global_stream(seed, "init.residual"):
+                self.residual = ResidualField(config)
         if config.single_mlp:
-            self.single = SingleMLP(config)
-        else:
-            self.static = StaticMLP(config) if config.canonical else None
-            self.deformation = DeformationNetwork(config) if config.deformation != "none" else None
+            with global_stream(seed, "init.single"):
+                self.single = SingleMLP(config)
+        elif config.canonical:
+            with global_stream(seed, "init.static"):
+                self.static = StaticMLP(config)
+        if not config.single_mlp and config.deformation != "none":
+            with global_stream(seed, "init.deformation"):
+                self.deformation = DeformationNetwork(config)
 
     def gaussians(self, eye: ArrayLike, time: float) -> Gaussians:
         """What is drawn at `time` in [0, 1] from a camera centre `eye` [3] (normalised units)."""

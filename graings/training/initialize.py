@@ -52,10 +52,7 @@ def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, stream
         features=torch.randn(count, scene.feature_dim, generator=generator) * FEATURE_STD,
         offsets=torch.randn(count, scene.children, 3, generator=generator) * config.init.offset_std,
     )
-    with torch.random.fork_rng(devices=[]):
-        # Modules draw their weights from the global stream; it is borrowed, seeded and given back.
-        torch.manual_seed(int(torch.randint(2**62, (1,), generator=streams["init.networks"])))
-        return Scene(scene, scaffold, extent=extent, initial_opacity=config.init.opacity), voxel
+    return Scene(scene, scaffold, extent=extent, initial_opacity=config.init.opacity, seed=config.seed), voxel
 
 
 def pixel_footprint(capture: Capture) -> float:

@@ -5,10 +5,10 @@ Each name seeds its own generator. Knows nothing of what the numbers are used fo
 
 from __future__ import annotations
 
-import hashlib
-
 import torch
 from torch import Tensor
+
+from graings.seeds import named_seed
 
 
 class Streams:
@@ -20,9 +20,8 @@ class Streams:
 
     def __getitem__(self, name: str) -> torch.Generator:
         if name not in self._generators:
-            digest = hashlib.sha256(f"{self.seed}/{name}".encode()).digest()
             generator = torch.Generator()
-            generator.manual_seed(int.from_bytes(digest[:8], "big") >> 1)
+            generator.manual_seed(named_seed(self.seed, name))
             self._generators[name] = generator
         return self._generators[name]
 

@@ -124,6 +124,8 @@ class Trainer:
         self.scene.temporal = phase.temporal
         frame = self.capture.train[self.sampler.next()]
         target = torch.from_numpy(self.images.rgb(frame))
+        if len(self.sampler.remaining) > 0:
+            self.images.prefetch(self.capture.train[int(self.sampler.remaining[0])])
 
         composition = self.scene.compose(frame.camera.center, frame.time)
         offset = torch.zeros(len(composition.gaussians), 2, requires_grad=True)

@@ -144,6 +144,28 @@ def test_image_larger_than_the_cache_is_still_returned(tmp_path: Path) -> None:
     assert store.cached_bytes == 0
 
 
+def test_a_frame_fetched_ahead_is_decoded_once_whatever_the_cache_holds(tmp_path: Path) -> None:
+    frame = frame_of(write_image(tmp_path / "a.png", pixels(700, 700, 3)))  # more than a megabyte
+    expected = ImageStore(BLUE).rgb(frame)
+    store = ImageStore(BLUE, cache_mb=1)
+    store.prefetch(frame)
+    store.prefetch(frame)
+    store._ahead.shutdown()  # waits until it is done
+    frame.image_path.unlink()
+    np.testing.assert_array_equal(store.rgb(frame), expected)
+    with pytest.raises(CaptureError):  # handed out once, and neither kept nor decoded again
+        store.rgb(frame)
+
+
+def test_what_goes_wrong_ahead_is_told_to_who_wants_the_frame(tmp_path: Path) -> None:
+    frame = frame_of(write_image(tmp_path / "a.png", pixels(7, 9)))
+    frame.image_path.write_bytes(frame.image_path.read_bytes()[:-60])
+    store = ImageStore(BLUE)
+    store.prefetch(frame)
+    with pytest.raises(CaptureError, match=r"a\.png: cannot be decoded"):
+        store.rgb(frame)
+
+
 def test_threads_see_the_same_pixels(tmp_path: Path) -> None:
     frames = [frame_of(write_image(tmp_path / f"{i}.png", pixels(40, 40, seed=i)), size=(17, 17)) for i in range(6)]
     expected = [ImageStore(BLUE).rgb(frame) for frame in frames]

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from graings import constants
+from graings import constants, kernel
 from graings.scene.clip import clip
-from graings.scene.encoding import encoding_width, frequency_encoding
+from graings.scene.encoding import encoding_width, frequency_encoding, plain_frequency_encoding
 from tests.models import EYE, tiny_scene
 
 
@@ -146,6 +146,36 @@ def test_projected_clip_passes_only_gradients_that_point_back_inside() -> None:
     x.grad = None
     clip(x, 0.0, 1.0, projected=False).backward(torch.ones(5))
     assert torch.equal(x.grad, torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 2.0**-24)])
+def test_encoding_by_the_kernel_equals_its_oracle_to_the_last_octave(dtype: torch.dtype, tolerance: float) -> None:
+    x = (torch.rand(2_500, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 4 - 2).to(dtype)
+    expected = plain_frequency_encoding(x.double(), 12)
+    assert (frequency_encoding(x, 12).double() - expected).abs().max() <= tolerance
+    kernel.set_threads(1)
+    alone = frequency_encoding(x, 12)
+    kernel.set_threads(None)
+    assert torch.equal(alone, frequency_encoding(x, 12))
+
+
+def test_encoding_is_differentiable_where_positions_are_not_constants() -> None:
+    x = torch.rand(4, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: frequency_encoding(x, 3), (x,))
+    with torch.no_grad():
+        assert torch.allclose(frequency_encoding(x, 3), plain_frequency_encoding(x, 3))
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf])
+def test_encoding_of_a_number_that_is_none_is_none(x: float) -> None:
+    assert frequency_encoding(torch.full((1, 3), x), 2)[:, 3:].isnan().all()
+
+
+def test_networks_begin_alike_whichever_others_there_are() -> None:
+    full, without = tiny_scene(awake=False), tiny_scene(awake=False, residual=False, canonical=False)
+    assert len(without.state_dict()) < len(full.state_dict())
+    for name, values in without.state_dict().items():
+        assert torch.equal(values, full.state_dict()[name]), name
 
 
 def test_encoding_has_the_stated_width_and_values() -> None:

@@ -240,6 +240,8 @@ def test_a_single_instant_leaves_the_deformation_out_and_says_so(capture: Path, 
         {"scene.residual": False},
         {"scene.canonical": False},
         {"scene.deformation": "anchor"},
+        {"scene.deform_time": "input"},
+        {"scene.deform_time": "input", "scene.single_mlp": True},
     ],
 )
 def test_every_ablation_of_the_paper_trains_and_renders(
@@ -260,3 +262,14 @@ def test_options_of_another_version_are_named_and_not_taken_for_damage(capture: 
     for read in (TrainingRun.resume, load_model):
         with pytest.raises(CheckpointError, match=r"scene\.gone_since.*Use the version that wrote it"):
             read(tmp_path / "run")
+
+
+def test_a_model_from_before_time_entered_as_a_product_is_still_read(capture: Path, tmp_path: Path) -> None:
+    list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=12, **{"scene.deform_time": "input"})))
+    expected = load_model(tmp_path / "run").scene
+    for path in (tmp_path / "run").glob("checkpoints/*/checkpoint.json"):
+        facts = json.loads(path.read_text())
+        del facts["scene_config"]["deform_time"], facts["config"]["scene"]["deform_time"]
+        path.write_text(json.dumps(facts))
+    found = load_model(tmp_path / "run").scene
+    assert torch.equal(found.gaussians((0.0, -3.0, 0.0), 0.7).means, expected.gaussians((0.0, -3.0, 0.0), 0.7).means)

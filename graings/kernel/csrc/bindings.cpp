@@ -15,6 +15,7 @@
 #endif
 
 #include "children.hpp"
+#include "encoding.hpp"
 #include "frame.hpp"
 #include "isa.hpp"
 #include "perceptron.hpp"
@@ -172,6 +173,13 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
               return new Frame<R>(camera, settings, in, ties, out, threads, gradient);
           },
           nb::rv_policy::take_ownership);
+    m.def("encode", [](In<R> x, int64_t dimensions, int octaves, Out<R> encoded, int threads) {
+        if (dimensions < 1 || octaves < 0 || x.size() % size_t(dimensions)) throw std::invalid_argument("x must hold rows of `dimensions` numbers");
+        const size_t rows = x.size() / size_t(dimensions);
+        R* out = checked(encoded, rows * size_t(dimensions * (1 + 2 * octaves)), "encoded");
+        nb::gil_scoped_release release;
+        graings::encode<R>(int64_t(rows), dimensions, octaves, x.data(), out, threads);
+    });
     m.def("network", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, Out<R> output, std::optional<Out<R>> hidden, int threads) {
         const int64_t rows = int64_t(input.shape(0));
         const auto layers = network<R>(input, rows, weights, biases);
