@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from graings.config import SceneConfig
-from graings.scene.perceptron import perceptron
+from graings.scene.children import Children
+from graings.scene.perceptron import Shared, perceptron
 
 # A child starts with about half the spacing of its neighbours as standard deviation: they overlap, but
 # none hides the next (decision 12).
@@ -24,7 +25,7 @@ class StaticMLP(nn.Module):
 
     `e_j` is a learned code per child slot shared by all anchors (decision 1), here directly its share of the
     first layer: the children of a new anchor have zero offsets and would otherwise be identical for ever.
-    rho_can is relative to log s_a.
+    rho_can is relative to log s_a. The feature's share of the first layer is computed once per anchor.
     """
 
     def __init__(self, config: SceneConfig) -> None:
@@ -39,10 +40,13 @@ class StaticMLP(nn.Module):
             self.out.bias.zero_()
             self.out.bias[4:] = math.log(INITIAL_SCALE)
 
-    def forward(self, inputs: Float[Tensor, "drawn width"]) -> Float[Tensor, "drawn 7"]:
-        """Quaternion less the identity and log-scale less log s_a, from `Children.inputs`."""
-        first = torch.cat([self.from_feature.weight, self.from_offset.weight, self.child_bias.t()], dim=1)
-        return perceptron(inputs, [first, self.out.weight], [self.from_feature.bias, self.out.bias])
+    def forward(self, features: Float[Tensor, "anchor feature"], drawn: Children) -> Float[Tensor, "drawn 7"]:
+        """Quaternion less the identity and log-scale less log s_a of the drawn children."""
+        first = torch.cat([self.from_offset.weight, self.child_bias.t()], dim=1)
+        shared = perceptron(features, [self.from_feature.weight], [self.from_feature.bias])
+        none = torch.zeros_like(self.from_feature.bias)
+        weights, biases = [first, self.out.weight], [none, self.out.bias]
+        return perceptron(drawn.inputs, weights, biases, shared=Shared(shared, drawn.anchors))
 
 
 def unlearned(children: Float[Tensor, "drawn 3"]) -> Float[Tensor, "drawn 7"]:

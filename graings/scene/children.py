@@ -31,7 +31,8 @@ LOG_SCALE_RANGE = (-16.118095650958319, 4.605170185988092)
 class Children:
     """What is known of N drawn children before any network has spoken."""
 
-    inputs: Float[Tensor, "drawn width"]  # feature of the anchor, offset, and a one at the child's slot
+    anchors: Int64[Tensor, " drawn"]  # the anchor of each, ascending
+    inputs: Float[Tensor, "drawn width"]  # offset, and a one at the child's slot
     centres: Float[Tensor, "drawn 3"]  # x_can, Eq. 4
     log_scales: Float[Tensor, "drawn 3"]  # log s_a of the anchor
 
@@ -41,9 +42,9 @@ def gather(scaffold: Scaffold, children: Int64[Tensor, " drawn"]) -> Children:
 
     Raises `ValueError` for any other order or slot.
     """
-    tensors = (scaffold.features, scaffold.log_scales, scaffold.offsets)
-    inputs, centres, log_scales = _Gather.apply(*tensors, scaffold.anchors, children, kernel.threads())  # type: ignore[no-untyped-call]
-    return Children(inputs, centres, log_scales)
+    tensors = (scaffold.log_scales, scaffold.offsets, scaffold.anchors)
+    inputs, centres, log_scales = _Gather.apply(*tensors, children, kernel.threads())  # type: ignore[no-untyped-call]
+    return Children(children // scaffold.slots, inputs, centres, log_scales)
 
 
 def plain_gather(scaffold: Scaffold, children: Int64[Tensor, " drawn"]) -> Children:
@@ -52,9 +53,9 @@ def plain_gather(scaffold: Scaffold, children: Int64[Tensor, " drawn"]) -> Child
     owners = children // k
     offsets = scaffold.offsets.flatten(0, 1).index_select(0, children)
     slots = torch.eye(k, dtype=offsets.dtype).index_select(0, children % k)
-    inputs = torch.cat([scaffold.features.index_select(0, owners), offsets, slots], dim=1)
+    inputs = torch.cat([offsets, slots], dim=1)
     log_scales = scaffold.log_scales.index_select(0, owners)
-    return Children(inputs, scaffold.anchors.index_select(0, owners) + log_scales.exp() * offsets, log_scales)
+    return Children(owners, inputs, scaffold.anchors.index_select(0, owners) + log_scales.exp() * offsets, log_scales)
 
 
 Geometry = tuple[Float[Tensor, "drawn 3"], Float[Tensor, "drawn 4"], Float[Tensor, "drawn 3"]]
@@ -119,12 +120,12 @@ def quaternion_product(a: Float[Tensor, "drawn 4"], b: Float[Tensor, "drawn 4"])
 class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, features: Tensor, log_scales: Tensor, offsets: Tensor, anchors: Tensor, children: Tensor, threads: int
+        ctx: Any, log_scales: Tensor, offsets: Tensor, anchors: Tensor, children: Tensor, threads: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        ready = [t.detach().contiguous() for t in (features, anchors, log_scales, offsets)]
+        ready = [t.detach().contiguous() for t in (anchors, log_scales, offsets)]
         drawn = len(children)
-        inputs = features.new_empty(drawn, features.shape[1] + 3 + offsets.shape[1])
-        centres, bases = features.new_empty(drawn, 3), features.new_empty(drawn, 3)
+        inputs = anchors.new_empty(drawn, 3 + offsets.shape[1])
+        centres, bases = anchors.new_empty(drawn, 3), anchors.new_empty(drawn, 3)
         kernel.kernel().gather(*ready, children, inputs, centres, bases, threads)
         ctx.save_for_backward(*ready, children)
         ctx.threads = threads
@@ -133,12 +134,10 @@ class _Gather(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_inputs: Tensor, v_centres: Tensor, v_bases: Tensor) -> tuple[Tensor | None, ...]:
-        features, anchors, log_scales, offsets, children = ctx.saved_tensors
-        gradients = [torch.empty_like(t) for t in (features, log_scales, offsets)]
+        anchors, log_scales, offsets, children = ctx.saved_tensors
+        gradients = [torch.empty_like(t) for t in (log_scales, offsets)]
         upstream = [v.contiguous() for v in (v_inputs, v_centres, v_bases)]
-        kernel.kernel().gather_gradient(
-            features, anchors, log_scales, offsets, children, *upstream, *gradients, ctx.threads
-        )
+        kernel.kernel().gather_gradient(anchors, log_scales, offsets, children, *upstream, *gradients, ctx.threads)
         return (*gradients, None, None, None)
 
 

@@ -15,8 +15,9 @@ from torch import Tensor, nn
 
 from graings.config import SceneConfig
 from graings.scene.canonical import INITIAL_SCALE
+from graings.scene.children import Children
 from graings.scene.encoding import encoding_width, frequency_encoding
-from graings.scene.perceptron import perceptron, weights_and_biases
+from graings.scene.perceptron import Shared, perceptron, weights_and_biases
 
 # Hidden width of psi. It runs once a frame.
 TIME_WIDTH = 64
@@ -106,17 +107,22 @@ class SingleMLP(nn.Module):
             self.out.bias[4:7] = math.log(INITIAL_SCALE)
 
     def forward(
-        self, inputs: Float[Tensor, "gaussian width"], positions: Float[Tensor, "gaussian 3"], time: Tensor | None
+        self,
+        features: Float[Tensor, "anchor feature"],
+        drawn: Children,
+        positions: Float[Tensor, "gaussian 3"],
+        time: Tensor | None,
     ) -> Float[Tensor, "gaussian 17"]:
-        """Raw outputs of the drawn children: `Children.inputs`, and the rest as in DeformationNetwork."""
-        first = [self.from_feature.weight, self.from_offset.weight, self.child_bias.t(), self.from_position.weight]
-        everything = [inputs, frequency_encoding(positions, self.position_frequencies)]
+        """Raw outputs of the drawn children: the first two as in StaticMLP, the rest as in DeformationNetwork."""
+        first = [self.from_offset.weight, self.child_bias.t(), self.from_position.weight]
+        everything = [drawn.inputs, frequency_encoding(positions, self.position_frequencies)]
+        shared = perceptron(features, [self.from_feature.weight], [self.from_feature.bias])
         weights, biases = weights_and_biases([*self.hidden, self.out])
-        weights, biases = [torch.cat(first, dim=1), *weights], [self.from_feature.bias, *biases]
+        weights, biases = [torch.cat(first, dim=1), *weights], [torch.zeros_like(self.from_feature.bias), *biases]
         moment = None if time is None else frequency_encoding(time, self.time_frequencies)
         if moment is not None and self.from_time is not None:
             biases[0] = biases[0] + self.from_time(moment)
         if moment is not None and self.psi is not None:
             canonical, temporal = weights[-1].split([7, 10])
             weights[-1] = torch.cat([canonical, temporal * self.psi(moment)])
-        return perceptron(torch.cat(everything, dim=1), weights, biases)
+        return perceptron(torch.cat(everything, dim=1), weights, biases, shared=Shared(shared, drawn.anchors))

@@ -7,10 +7,10 @@ of rows through all layers while they lie in cache. Knows nothing of what the ro
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
@@ -18,17 +18,26 @@ from torch.nn import functional
 from graings import kernel
 
 
+class Shared(NamedTuple):
+    """What rows have in common: `values` are added to the first layer of the rows of a group, `groups` ascend."""
+
+    values: Float[Tensor, "group first"]
+    groups: Int64[Tensor, " row"]
+
+
 def perceptron(
     inputs: Float[Tensor, "row input"],
     weights: Sequence[Float[Tensor, "_ _"]],
     biases: Sequence[Float[Tensor, " _"]],
     *,
+    shared: Shared | None = None,
     threads: int | None = None,
 ) -> Float[Tensor, "row output"]:
-    """W_n relu(... relu(W_1 x + b_1) ...) + b_n for each row x; weights are [out, in] as torch's.
+    """W_n relu(... relu(W_1 x + s + b_1) ...) + b_n for each row x; weights are [out, in] as torch's.
 
-    Differentiable once in everything. `threads` is the number of CPU threads (None: the kernel's default); values and
-    gradients have the same bits for any number. Raises `ValueError` for a wrong shape, dtype or device.
+    s is the row's part of `shared`, if given. Differentiable once in everything. `threads` is the number of CPU threads
+    (None: the kernel's default); values and gradients have the same bits for any number. Raises `ValueError` for a
+    wrong shape, dtype, device or order of groups.
     """
     width, kind = inputs.shape[-1], inputs.dtype
     if inputs.ndim != 2 or kind not in (torch.float32, torch.float64):
@@ -42,13 +51,22 @@ def perceptron(
                 f"got {tuple(weight.shape)} and {tuple(bias.shape)}"
             )
         width = weight.shape[0]
-    tensors = (inputs, *weights, *biases)
+    groups: Tensor | None = None
+    tensors = [inputs, *weights, *biases]
+    if shared is not None:
+        groups = shared.groups
+        if shared.values.ndim != 2 or shared.values.shape[1] != len(biases[0]) or groups.shape != inputs.shape[:1]:
+            raise ValueError(
+                f"shared values must be [group, {len(biases[0])}] with a group for each of {len(inputs)} rows, "
+                f"got {tuple(shared.values.shape)} and {tuple(groups.shape)}"
+            )
+        tensors.append(shared.values)
     if any(t.dtype != kind or t.device.type != "cpu" for t in tensors):
-        raise ValueError(f"inputs, weights and biases must all be {kind} on the CPU")
+        raise ValueError(f"inputs, weights, biases and shared values must all be {kind} on the CPU")
     workers = kernel.threads() if threads is None else threads
     if workers < 1:
         raise ValueError(f"threads must be at least 1, got {workers}")
-    values: Tensor = _Perceptron.apply(workers, *tensors)  # type: ignore[no-untyped-call]
+    values: Tensor = _Perceptron.apply(workers, groups, *tensors)  # type: ignore[no-untyped-call]
     return values
 
 
@@ -56,9 +74,13 @@ def plain_perceptron(
     inputs: Float[Tensor, "row input"],
     weights: Sequence[Float[Tensor, "_ _"]],
     biases: Sequence[Float[Tensor, " _"]],
+    *,
+    shared: Shared | None = None,
 ) -> Float[Tensor, "row output"]:
     """The oracle of `perceptron`: the same chain as torch writes it, layer by layer."""
     values = functional.linear(inputs, weights[0], biases[0])
+    if shared is not None:
+        values = values + shared.values.index_select(0, shared.groups)
     for weight, bias in zip(weights[1:], biases[1:], strict=True):
         values = functional.linear(functional.relu(values), weight, bias)
     return values
@@ -72,31 +94,34 @@ def weights_and_biases(layers: Iterable[nn.Module]) -> tuple[list[Tensor], list[
 
 class _Perceptron(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, threads: int, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, threads: int, groups: Tensor | None, *tensors: Tensor) -> Tensor:
         ready = [t.detach().contiguous() for t in tensors]
-        inputs, weights, biases = _parts(ready)
+        inputs, weights, biases, shared = _parts(ready)
+        groups = None if groups is None else groups.contiguous()
         output = inputs.new_empty(len(inputs), len(biases[-1]))
         hidden: Tensor | None = None
         if any(ctx.needs_input_grad):
             hidden = inputs.new_empty(kernel.kernel().hidden_size([inputs.shape[1], *map(len, biases)], len(inputs)))
-            ctx.save_for_backward(hidden, *ready)
+            ctx.save_for_backward(hidden, groups, *ready)
             ctx.threads = threads
-        kernel.kernel().network(inputs, weights, biases, output, hidden, threads)
+        kernel.kernel().network(inputs, weights, biases, shared, groups, output, hidden, threads)
         return output
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        hidden, *ready = ctx.saved_tensors
-        inputs, weights, biases = _parts(ready)
-        v_inputs = torch.empty_like(inputs) if ctx.needs_input_grad[1] else None
+        hidden, groups, *ready = ctx.saved_tensors
+        inputs, weights, biases, shared = _parts(ready)
+        v_inputs = torch.empty_like(inputs) if ctx.needs_input_grad[2] else None
+        v_shared = None if shared is None else torch.empty_like(shared)
         v_weights, v_biases = [torch.empty_like(w) for w in weights], [torch.empty_like(b) for b in biases]
-        kernel.kernel().network_gradient(
-            inputs, weights, biases, hidden, upstream.contiguous(), v_inputs, v_weights, v_biases, ctx.threads
-        )
-        return None, v_inputs, *v_weights, *v_biases
+        given, gradients = (inputs, weights, biases, shared, groups), (v_inputs, v_weights, v_biases, v_shared)
+        kernel.kernel().network_gradient(*given, hidden, upstream.contiguous(), *gradients, ctx.threads)
+        return None, None, v_inputs, *v_weights, *v_biases, *([] if v_shared is None else [v_shared])
 
 
-def _parts(tensors: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+def _parts(tensors: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor], Tensor | None]:
+    """Inputs, weights, biases, and what is shared: the odd one out behind as many biases as weights."""
     inputs, *rest = tensors
-    return inputs, rest[: len(rest) // 2], rest[len(rest) // 2 :]
+    layers = len(rest) // 2
+    return inputs, rest[:layers], rest[layers : 2 * layers], rest[-1] if len(rest) % 2 else None

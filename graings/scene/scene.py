@@ -135,7 +135,7 @@ class Scene(nn.Module):
         if not self.temporal or (self.deformation is None and self.single is None):
             return None
         if self.single is not None:
-            raw = self._single(self.single, gather(self.scaffold, children).inputs, canonical_means, time)[:, 7:]
+            raw = self._single(self.single, gather(self.scaffold, children), canonical_means, time)[:, 7:]
         else:
             raw = self._moved(children, canonical_means, time)
         return deformation_from(raw, float(self.extent))
@@ -143,9 +143,9 @@ class Scene(nn.Module):
     def _answers(self, drawn: Children, children: Tensor, time: float) -> tuple[Tensor, Tensor | None]:
         """What the networks say of the drawn children: canonical geometry, and its change unless nothing moves."""
         if self.single is not None:
-            raw = self._single(self.single, drawn.inputs, drawn.centres, time if self.temporal else None)
+            raw = self._single(self.single, drawn, drawn.centres, time if self.temporal else None)
             return raw[:, :7], raw[:, 7:] if self.temporal else None
-        canonical = unlearned(drawn.centres) if self.static is None else self.static(drawn.inputs)
+        canonical = unlearned(drawn.centres) if self.static is None else self.static(self.scaffold.features, drawn)
         moves = self.temporal and self.deformation is not None
         return canonical, self._moved(children, drawn.centres, time) if moves else None
 
@@ -160,9 +160,9 @@ class Scene(nn.Module):
         own: Tensor = self.deformation(self._positions(canonical_means), moment)
         return own
 
-    def _single(self, single: SingleMLP, inputs: Tensor, canonical_means: Tensor, time: float | None) -> Tensor:
-        moment = None if time is None else torch.tensor([time], dtype=inputs.dtype)
-        raw: Tensor = single(inputs, self._positions(canonical_means), moment)
+    def _single(self, single: SingleMLP, drawn: Children, canonical_means: Tensor, time: float | None) -> Tensor:
+        moment = None if time is None else torch.tensor([time], dtype=canonical_means.dtype)
+        raw: Tensor = single(self.scaffold.features, drawn, self._positions(canonical_means), moment)
         return raw
 
     def _positions(self, canonical_means: Tensor) -> Tensor:

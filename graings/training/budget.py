@@ -32,9 +32,9 @@ def bytes_per_anchor(config: SceneConfig) -> int:
     statistics = 16 * k + 16
     # Positions and uids are kept as they are; growth and pruning hold old and new rows at once.
     fixed = 20 * (1 + COPIES) + statistics * 4
-    static = config.feature_dim + 3 + k + config.static_width
+    static = 3 + k + config.static_width
     deform = encoding_width(3, config.position_frequencies) + config.deform_width * config.deform_depth
-    heads = (config.feature_dim + 3) + 3 * config.head_width + 8 * k
+    heads = (config.feature_dim + 3) + 3 * config.head_width + 8 * k + config.static_width
     activations = BOTH_WAYS * FLOAT * (k * (static + deform + CHILD_FLOATS) + heads)
     return FLOAT * rows * COPIES + fixed + activations
 

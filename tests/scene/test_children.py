@@ -47,7 +47,11 @@ def answers(drawn: int, dtype: torch.dtype, *, moves: bool) -> Answers:
     canonical, moved = numbers(drawn, 7), numbers(drawn, 10) * 2
     canonical[0, :4] = torch.tensor([-1.0, 0.0, 0.0, 0.0])
     canonical[1, 4:], canonical[2, 4:] = 9.0, -30.0
-    return canonical, Children(numbers(drawn, 1), numbers(drawn, 3), numbers(drawn, 3)), moved if moves else None
+    return (
+        canonical,
+        Children(torch.arange(drawn), numbers(drawn, 1), numbers(drawn, 3), numbers(drawn, 3)),
+        moved if moves else None,
+    )
 
 
 def gathered(function: Callable[..., Children], given: Scaffold, children: Tensor) -> list[Tensor]:
@@ -59,7 +63,8 @@ def gathered(function: Callable[..., Children], given: Scaffold, children: Tenso
     random = torch.Generator().manual_seed(3)
     upstream = [torch.randn(v.shape, generator=random, dtype=torch.float64).to(v.dtype) for v in values]
     torch.autograd.backward(values, upstream)
-    return [*(v.detach() for v in values), given.features.grad, given.log_scales.grad, given.offsets.grad]  # type: ignore[list-item]
+    assert torch.equal(result.anchors, children // SLOTS)
+    return [*(v.detach() for v in values), given.log_scales.grad, given.offsets.grad]  # type: ignore[list-item]
 
 
 def composed(function: Callable[..., tuple[Tensor, ...]], given: Answers, *, projected: bool = True) -> list[Tensor]:
@@ -67,7 +72,7 @@ def composed(function: Callable[..., tuple[Tensor, ...]], given: Answers, *, pro
     leaves = [t.clone().requires_grad_() for t in (canonical, children.log_scales, children.centres)]
     if moved is not None:
         leaves.append(moved.clone().requires_grad_())
-    drawn = Children(children.inputs, leaves[2], leaves[1])
+    drawn = Children(children.anchors, children.inputs, leaves[2], leaves[1])
     values = function(leaves[0], drawn, leaves[3] if moved is not None else None, 1.7, projected_clip=projected)
     random = torch.Generator().manual_seed(4)
     upstream = [torch.randn(v.shape, generator=random, dtype=torch.float64).to(v.dtype) for v in values]
@@ -107,7 +112,7 @@ def test_bounds_hold() -> None:
     _, _, log_scales = compose(*answers(50, torch.float32, moves=True), 1.0, projected_clip=True)
     assert log_scales.min() >= LOG_SCALE_RANGE[0]
     assert log_scales.max() <= LOG_SCALE_RANGE[1]
-    still = Children(torch.zeros(1, 1), torch.zeros(1, 3), torch.zeros(1, 3))
+    still = Children(torch.zeros(1, dtype=torch.int64), torch.zeros(1, 1), torch.zeros(1, 3), torch.zeros(1, 3))
     moved = torch.tensor([[0.0] * 7 + [3.0, 0.5, -9.0]])
     _, _, change = compose(torch.zeros(1, 7), still, moved, 1.0, projected_clip=True)
     assert torch.equal(change, torch.tensor([[LOG_SCALE_BOUND, 0.5, -LOG_SCALE_BOUND]]))
@@ -131,15 +136,13 @@ def test_gradcheck_passes() -> None:
 
     def through(*values: Tensor) -> tuple[Tensor, ...]:
         holder = scaffold(6)
-        for name, value in zip(("features", "log_scales", "offsets"), values, strict=False):
+        for name, value in zip(("log_scales", "offsets"), values, strict=False):
             delattr(holder, name)
             setattr(holder, name, value)
         drawn = gather(holder, children)
-        return (*compose(values[3], drawn, values[4], 1.3, projected_clip=False), drawn.inputs)
+        return (*compose(values[2], drawn, values[3], 1.3, projected_clip=False), drawn.inputs)
 
-    leaves = [
-        t.detach().clone().requires_grad_() for t in (given.features, given.log_scales, given.offsets, canonical, moved)
-    ]
+    leaves = [t.detach().clone().requires_grad_() for t in (given.log_scales, given.offsets, canonical, moved)]
     assert torch.autograd.gradcheck(through, leaves)
 
 

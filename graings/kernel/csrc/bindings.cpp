@@ -50,7 +50,8 @@ graings::Inputs<R> inputs(const In<R>& means, const In<R>& quats, const In<R>& l
 }
 
 template <class R>
-graings::Network<R> network(const In<R>& input, int64_t rows, const std::vector<In<R>>& weights, const std::vector<In<R>>& biases) {
+graings::Network<R> network(const In<R>& input, int64_t rows, const std::vector<In<R>>& weights, const std::vector<In<R>>& biases,
+                            const std::optional<In<R>>& shared, const std::optional<In<int64_t>>& group) {
     if (weights.empty() || weights.size() > graings::kMaxLayers || biases.size() != weights.size())
         throw std::invalid_argument("a network has 1 to " + std::to_string(graings::kMaxLayers) + " layers, each with a weight and a bias");
     graings::Network<R> result;
@@ -62,14 +63,18 @@ graings::Network<R> network(const In<R>& input, int64_t rows, const std::vector<
         result.widths.push_back(int64_t(out));
     }
     checked(input, size_t(rows * result.widths[0]), "input");
+    if (!shared) return result;
+    if (!group) throw std::invalid_argument("what is shared needs the group of every row");
+    result.groups = int64_t(shared->shape(0));
+    result.shared = checked(*shared, size_t(result.groups * result.widths[1]), "shared");
+    result.group = checked(*group, size_t(rows), "group");
     return result;
 }
 
 template <class R>
-graings::Anchors<R> anchors(const In<R>& feature, const In<R>& place, const In<R>& log_scale, const In<R>& offset) {
-    const size_t count = feature.shape(0), slots = offset.shape(1);
-    return {int64_t(count), int64_t(slots), int64_t(feature.shape(1)), feature.data(), checked(place, 3 * count, "anchors"),
-            checked(log_scale, 3 * count, "log_scales"), checked(offset, 3 * count * slots, "offsets")};
+graings::Anchors<R> anchors(const In<R>& place, const In<R>& log_scale, const In<R>& offset) {
+    const size_t count = place.shape(0), slots = offset.shape(1);
+    return {int64_t(count), int64_t(slots), place.data(), checked(log_scale, 3 * count, "log_scales"), checked(offset, 3 * count * slots, "offsets")};
 }
 
 template <class R>
@@ -82,24 +87,23 @@ graings::Answers<R> answers(const In<R>& canonical, const In<R>& base, const In<
 
 template <class R>
 void bind_children(nb::module_& m) {
-    m.def("gather", [](In<R> feature, In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, Out<R> row, Out<R> centre, Out<R> base, int threads) {
-        const auto from = anchors<R>(feature, place, log_scale, offset);
+    m.def("gather", [](In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, Out<R> row, Out<R> centre, Out<R> base, int threads) {
+        const auto from = anchors<R>(place, log_scale, offset);
         const size_t drawn = children.size();
-        R *rows = checked(row, drawn * size_t(from.features + 3 + from.slots), "row"), *centres = checked(centre, 3 * drawn, "centre");
+        R *rows = checked(row, drawn * size_t(3 + from.slots), "row"), *centres = checked(centre, 3 * drawn, "centre");
         R* bases = checked(base, 3 * drawn, "base");
         nb::gil_scoped_release release;
         graings::gather<R>(from, int64_t(drawn), children.data(), rows, centres, bases, threads);
     });
-    m.def("gather_gradient", [](In<R> feature, In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, In<R> v_row, In<R> v_centre, In<R> v_base,
-                                Out<R> v_feature, Out<R> v_log_scale, Out<R> v_offset, int threads) {
-        const auto from = anchors<R>(feature, place, log_scale, offset);
+    m.def("gather_gradient", [](In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, In<R> v_row, In<R> v_centre, In<R> v_base, Out<R> v_log_scale,
+                                Out<R> v_offset, int threads) {
+        const auto from = anchors<R>(place, log_scale, offset);
         const size_t drawn = children.size();
-        const R *row = checked(v_row, drawn * size_t(from.features + 3 + from.slots), "v_row"), *centre = checked(v_centre, 3 * drawn, "v_centre");
+        const R *row = checked(v_row, drawn * size_t(3 + from.slots), "v_row"), *centre = checked(v_centre, 3 * drawn, "v_centre");
         const R* base = checked(v_base, 3 * drawn, "v_base");
-        R *features = checked(v_feature, feature.size(), "v_feature"), *scales = checked(v_log_scale, log_scale.size(), "v_log_scale");
-        R* offsets = checked(v_offset, offset.size(), "v_offset");
+        R *scales = checked(v_log_scale, log_scale.size(), "v_log_scale"), *offsets = checked(v_offset, offset.size(), "v_offset");
         nb::gil_scoped_release release;
-        graings::gather_gradient<R>(from, int64_t(drawn), children.data(), row, centre, base, features, scales, offsets, threads);
+        graings::gather_gradient<R>(from, int64_t(drawn), children.data(), row, centre, base, scales, offsets, threads);
     });
     m.def("compose", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> moved, double extent, double change, double low, double high, bool projected,
                         Out<R> mean, Out<R> quat, Out<R> log_scale, int threads) {
@@ -180,21 +184,24 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         nb::gil_scoped_release release;
         graings::encode<R>(int64_t(rows), dimensions, octaves, x.data(), out, threads);
     });
-    m.def("network", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, Out<R> output, std::optional<Out<R>> hidden, int threads) {
+    m.def("network", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, std::optional<In<R>> shared, std::optional<In<int64_t>> group,
+                        Out<R> output, std::optional<Out<R>> hidden, int threads) {
         const int64_t rows = int64_t(input.shape(0));
-        const auto layers = network<R>(input, rows, weights, biases);
+        const auto layers = network<R>(input, rows, weights, biases, shared, group);
         R* out = checked(output, size_t(rows * layers.widths.back()), "output");
         R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows)), "hidden");
         nb::gil_scoped_release release;
         graings::evaluate<R>(layers, rows, input.data(), out, kept, threads);
     });
-    m.def("network_gradient", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, Out<R> hidden, In<R> v_output, std::optional<Out<R>> v_input,
-                                 std::vector<Out<R>> v_weights, std::vector<Out<R>> v_biases, int threads) {
+    m.def("network_gradient", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, std::optional<In<R>> shared, std::optional<In<int64_t>> group,
+                                 Out<R> hidden, In<R> v_output, std::optional<Out<R>> v_input, std::vector<Out<R>> v_weights, std::vector<Out<R>> v_biases,
+                                 std::optional<Out<R>> v_shared, int threads) {
         const int64_t rows = int64_t(input.shape(0));
-        const auto layers = network<R>(input, rows, weights, biases);
+        const auto layers = network<R>(input, rows, weights, biases, shared, group);
         const R* upstream = checked(v_output, size_t(rows * layers.widths.back()), "v_output");
         R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows)), "hidden");
-        R* v_in = checked(v_input, input.size(), "v_input");
+        R *v_in = checked(v_input, input.size(), "v_input"), *v_common = checked(v_shared, shared ? shared->size() : 0, "v_shared");
+        if (shared && !v_common) throw std::invalid_argument("what is shared needs a place for its gradient");
         if (v_weights.size() != weights.size() || v_biases.size() != weights.size()) throw std::invalid_argument("one gradient per weight and bias");
         std::vector<R*> w, b;
         for (size_t l = 0; l < weights.size(); l++) {
@@ -202,7 +209,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
             b.push_back(checked(v_biases[l], biases[l].size(), "bias gradient"));
         }
         nb::gil_scoped_release release;
-        graings::differentiate<R>(layers, rows, input.data(), kept, upstream, v_in, w, b, threads);
+        graings::differentiate<R>(layers, rows, input.data(), kept, upstream, v_in, w, b, v_common, threads);
     });
     m.def("compare", [](In<R> image, In<R> target, int64_t height, int64_t width, double similarity, double absolute, std::optional<Out<R>> gradient, int threads) {
         const size_t size = size_t(3 * height * width);

@@ -64,7 +64,7 @@ R through(R v, R x, R low, R high, bool projected) {
 
 template <class R>
 void gather(const Anchors<R>& anchors, int64_t drawn, const int64_t* children, R* row, R* centre, R* base, int threads) {
-    const int64_t slots = anchors.slots, features = anchors.features, width = features + 3 + slots;
+    const int64_t slots = anchors.slots, width = 3 + slots;
     for (int64_t i = 0; i < drawn; i++)
         if (children[i] < (i ? children[i - 1] + 1 : 0) || children[i] >= anchors.count * slots)
             throw std::invalid_argument("children must be slots of these anchors in ascending order");
@@ -72,10 +72,9 @@ void gather(const Anchors<R>& anchors, int64_t drawn, const int64_t* children, R
         for (int64_t i = begin; i < end; i++) {
             const int64_t owner = children[i] / slots, slot = children[i] % slots;
             R* to = row + i * width;
-            std::copy_n(anchors.feature + owner * features, features, to);
-            std::copy_n(anchors.offset + 3 * children[i], 3, to + features);
-            std::fill_n(to + features + 3, slots, R(0));
-            to[features + 3 + slot] = R(1);
+            std::copy_n(anchors.offset + 3 * children[i], 3, to);
+            std::fill_n(to + 3, slots, R(0));
+            to[3 + slot] = R(1);
             for (int c = 0; c < 3; c++) {
                 const R scale = anchors.log_scale[3 * owner + c];
                 base[3 * i + c] = scale;
@@ -86,21 +85,18 @@ void gather(const Anchors<R>& anchors, int64_t drawn, const int64_t* children, R
 }
 
 template <class R>
-void gather_gradient(const Anchors<R>& anchors, int64_t drawn, const int64_t* children, const R* v_row, const R* v_centre, const R* v_base, R* v_feature, R* v_log_scale,
-                     R* v_offset, int threads) {
-    const int64_t slots = anchors.slots, features = anchors.features, width = features + 3 + slots;
+void gather_gradient(const Anchors<R>& anchors, int64_t drawn, const int64_t* children, const R* v_row, const R* v_centre, const R* v_base, R* v_log_scale, R* v_offset,
+                     int threads) {
+    const int64_t slots = anchors.slots, width = 3 + slots;
     in_runs(threads, anchors.count, slots, drawn, children, [&](int64_t first, int64_t last, int64_t from, int64_t to) {
-        std::fill(v_feature + first * features, v_feature + last * features, R(0));
         std::fill(v_log_scale + 3 * first, v_log_scale + 3 * last, R(0));
         std::fill(v_offset + 3 * first * slots, v_offset + 3 * last * slots, R(0));
         for (int64_t i = from; i < to; i++) {
             const int64_t owner = children[i] / slots;
             const R* v = v_row + i * width;
-            R* feature = v_feature + owner * features;
-            for (int64_t f = 0; f < features; f++) feature[f] += v[f];
             for (int c = 0; c < 3; c++) {
                 const R stretch = std::exp(anchors.log_scale[3 * owner + c]), g = v_centre[3 * i + c] * stretch;
-                v_offset[3 * children[i] + c] = v[features + c] + g;
+                v_offset[3 * children[i] + c] = v[c] + g;
                 v_log_scale[3 * owner + c] += v_base[3 * i + c] + g * anchors.offset[3 * children[i] + c];
             }
         }
@@ -160,7 +156,7 @@ void compose_gradient(const Answers<R>& in, const R* v_mean, const R* v_quat, co
 
 #define GRAINGS_INSTANTIATE(R)                                                                                                           \
     template void gather<R>(const Anchors<R>&, int64_t, const int64_t*, R*, R*, R*, int);                                                \
-    template void gather_gradient<R>(const Anchors<R>&, int64_t, const int64_t*, const R*, const R*, const R*, R*, R*, R*, int);          \
+    template void gather_gradient<R>(const Anchors<R>&, int64_t, const int64_t*, const R*, const R*, const R*, R*, R*, int);              \
     template void compose<R>(const Answers<R>&, R*, R*, R*, int);                                                                        \
     template void compose_gradient<R>(const Answers<R>&, const R*, const R*, const R*, R*, R*, int);
 GRAINGS_INSTANTIATE(float)

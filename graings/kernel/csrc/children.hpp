@@ -7,19 +7,19 @@ namespace graings {
 
 template <class R>
 struct Anchors {
-    int64_t count, slots, features;             // features: numbers per anchor
-    const R *feature, *place, *log_scale, *offset;  // [count, .], [count, 3], [count, 3], [count * slots, 3]
+    int64_t count, slots;
+    const R *place, *log_scale, *offset;  // [count, 3], [count, 3], [count * slots, 3]
 };
 
-// row [drawn, features + 3 + slots]: feature, offset, and a one at the child's slot; centre [drawn, 3] = place +
-// exp(log_scale) * offset (Eq. 4); base [drawn, 3] = log_scale. Throws std::invalid_argument when children do not ascend.
+// row [drawn, 3 + slots]: offset, and a one at the child's slot; centre [drawn, 3] = place + exp(log_scale) * offset
+// (Eq. 4); base [drawn, 3] = log_scale. Throws std::invalid_argument when children do not ascend.
 template <class R>
 void gather(const Anchors<R>&, int64_t drawn, const int64_t* children, R* row, R* centre, R* base, int threads);
 
 // The adjoint; all gradients of the anchors are written, zero where nothing is drawn.
 template <class R>
-void gather_gradient(const Anchors<R>&, int64_t drawn, const int64_t* children, const R* v_row, const R* v_centre, const R* v_base, R* v_feature, R* v_log_scale,
-                     R* v_offset, int threads);
+void gather_gradient(const Anchors<R>&, int64_t drawn, const int64_t* children, const R* v_row, const R* v_centre, const R* v_base, R* v_log_scale, R* v_offset,
+                     int threads);
 
 // Bounds of log-scales: of their change in time, and of the result.
 struct ScaleBounds {

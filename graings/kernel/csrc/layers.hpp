@@ -65,6 +65,30 @@ GRAINGS_INLINE void place(const NetworkArgs<R>& args, int64_t row, R* scratch, R
     for (int l = 1; l < args.layers; l++) levels[l] = block + (args.offsets[l] - args.offsets[1]);
 }
 
+// The bias of layer l in every row of a block, and what the row's group adds to the first.
+template <class R>
+GRAINGS_INLINE void begin_layer(const NetworkArgs<R>& args, int l, int64_t row, int64_t rows, int64_t strips, R* to) {
+    const int64_t out = args.padded[l + 1], width = args.widths[l + 1];
+    for (int64_t r = 0; r < strips; r++) std::memcpy(to + r * out, args.biases[l], sizeof(R) * size_t(out));
+    if (l > 0 || !args.shared) return;
+    for (int64_t r = 0; r < rows; r++) {
+        const R* shared = args.shared + args.groups[row + r] * width;
+        for (int64_t c = 0; c < width; c++) to[r * out + c] += shared[c];
+    }
+}
+
+// The gradient of the groups' shares from that of a block's first layer. Pieces run side by side: what belongs to a
+// group that began before `begin` goes to a place of its own.
+template <class R>
+GRAINGS_INLINE void add_to_groups(const NetworkArgs<R>& args, int64_t begin, int64_t row, int64_t rows, const R* above, R* sums) {
+    const int64_t out = args.padded[1], width = args.widths[1], before = begin ? args.groups[begin - 1] : -1;
+    for (int64_t r = 0; r < rows; r++) {
+        const int64_t group = args.groups[row + r];
+        R* to = group == before ? sums + args.first_group_at : args.v_shared + group * width;
+        for (int64_t c = 0; c < width; c++) to[c] += above[r * out + c];
+    }
+}
+
 // Output rows [begin, end). A NaN stays one through ReLU.
 template <class R>
 static void network_values(const NetworkArgs<R>& args, int64_t begin, int64_t end, R* scratch) {
@@ -78,7 +102,7 @@ static void network_values(const NetworkArgs<R>& args, int64_t begin, int64_t en
         for (int l = 0; l < args.layers; l++) {
             const int64_t in = args.padded[l], out = args.padded[l + 1];
             R* to = levels[l + 1];
-            for (int64_t r = 0; r < strips; r++) std::memcpy(to + r * out, args.biases[l], sizeof(R) * size_t(out));
+            begin_layer(args, l, row, rows, strips, to);
             multiply<R, true>(strips, out, args.widths[l], levels[l], in, 1, args.forward[l], out, to, out);
             if (l + 1 < args.layers)
                 for (int64_t i = 0; i < strips * out; i += width) store(to + i, max(zero, load<width>(to + i)));
@@ -108,6 +132,7 @@ static void network_gradient(const NetworkArgs<R>& args, int64_t begin, int64_t 
                 for (int64_t r = 0; r < rows; r++) sum = sum + load<width>(above + r * out + c);
                 store(bias + c, sum);
             }
+            if (l == 0 && args.shared) add_to_groups(args, begin, row, rows, above, sums);
             if (l == 0 && !args.v_input) break;
             multiply<R, false>(strips, in, args.widths[l + 1], above, out, 1, args.backward[l], in, below, in);
             if (l == 0) {

@@ -24,7 +24,7 @@ struct Packed {
 
     Packed(const Network<R>& network, const R* input, R* hidden, bool gradient) {
         args.layers = int(network.weights.size());
-        args.input = input, args.hidden = hidden;
+        args.input = input, args.hidden = hidden, args.shared = network.shared, args.groups = network.group;
         int64_t size = 0;
         for (int l = 0; l <= args.layers; l++) {
             args.widths[l] = network.widths[size_t(l)], args.padded[l] = up(args.widths[l], kNetworkPad);
@@ -38,6 +38,7 @@ struct Packed {
             args.weight_at[l] = sums, args.bias_at[l] = sums + weight, sums += weight + args.padded[l + 1];
             size += (gradient ? 2 : 1) * weight + args.padded[l + 1];
         }
+        args.first_group_at = sums;
         numbers = Buffer<R>(size_t(size));
         std::fill_n(numbers.get(), size, R(0));
         R* at = numbers.get();
@@ -67,6 +68,9 @@ int64_t hidden_size(const std::vector<int64_t>& widths, int64_t rows) {
 
 template <class R>
 void evaluate(const Network<R>& network, int64_t rows, const R* input, R* output, R* hidden, int threads) {
+    for (int64_t row = 0; network.shared && row < rows; row++)
+        if (network.group[row] < (row ? network.group[row - 1] : 0) || network.group[row] >= network.groups)
+            throw std::invalid_argument("groups must ascend and lie within what is shared");
     Packed<R> packed(network, input, hidden, false);
     packed.args.output = output;
     const int64_t pieces = up(rows, kPieceRows) / kPieceRows;
@@ -77,20 +81,26 @@ void evaluate(const Network<R>& network, int64_t rows, const R* input, R* output
 }
 
 template <class R>
-void differentiate(const Network<R>& network, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, int threads) {
+void differentiate(const Network<R>& network, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, R* v_shared, int threads) {
     Packed<R> packed(network, input, hidden, true);
     NetworkArgs<R>& args = packed.args;
-    args.v_output = v_output, args.v_input = v_input;
-    const int64_t pieces = up(rows, kPieceRows) / kPieceRows;
-    Buffer<R> scratch(size_t(threads) * size_t(packed.scratch)), sums(size_t(std::max<int64_t>(pieces, 1)) * size_t(packed.sums));
-    std::fill_n(sums.get(), packed.sums, R(0));
+    args.v_output = v_output, args.v_input = v_input, args.v_shared = v_shared;
+    if (args.shared) std::fill_n(v_shared, network.groups * args.widths[1], R(0));
+    const int64_t pieces = up(rows, kPieceRows) / kPieceRows, stride = packed.sums + (args.shared ? args.padded[1] : 0);
+    Buffer<R> scratch(size_t(threads) * size_t(packed.scratch)), sums(size_t(std::max<int64_t>(pieces, 1)) * size_t(stride));
+    std::fill_n(sums.get(), stride, R(0));
     parallel_for(threads, pieces, [&](int worker, int64_t piece) {
-        R* own = sums.get() + piece * packed.sums;
-        std::fill_n(own, packed.sums, R(0));
+        R* own = sums.get() + piece * stride;
+        std::fill_n(own, stride, R(0));
         kernels<R>().network_gradient(args, piece * kPieceRows, std::min(rows, (piece + 1) * kPieceRows), own, scratch.get() + worker * packed.scratch);
     });
-    for (int64_t piece = 1; piece < pieces; piece++)
-        for (int64_t i = 0; i < packed.sums; i++) sums[size_t(i)] += sums[size_t(piece * packed.sums + i)];
+    for (int64_t piece = 1; piece < pieces; piece++) {
+        const R* own = sums.get() + piece * stride;
+        for (int64_t i = 0; i < packed.sums; i++) sums[size_t(i)] += own[i];
+        if (!args.shared) continue;
+        R* to = v_shared + args.groups[piece * kPieceRows - 1] * args.widths[1];
+        for (int64_t c = 0; c < args.widths[1]; c++) to[c] += own[args.first_group_at + c];
+    }
     for (int l = 0; l < args.layers; l++) {
         const int64_t ins = args.widths[l], outs = args.widths[l + 1];
         for (int64_t o = 0; o < outs; o++) std::copy_n(sums.get() + args.weight_at[l] + o * args.padded[l], ins, v_weights[size_t(l)] + o * ins);
@@ -100,7 +110,7 @@ void differentiate(const Network<R>& network, int64_t rows, const R* input, R* h
 
 #define GRAINGS_INSTANTIATE(R)                                                              \
     template void evaluate<R>(const Network<R>&, int64_t, const R*, R*, R*, int);           \
-    template void differentiate<R>(const Network<R>&, int64_t, const R*, R*, const R*, R*, const std::vector<R*>&, const std::vector<R*>&, int);
+    template void differentiate<R>(const Network<R>&, int64_t, const R*, R*, const R*, R*, const std::vector<R*>&, const std::vector<R*>&, R*, int);
 GRAINGS_INSTANTIATE(float)
 GRAINGS_INSTANTIATE(double)
 #undef GRAINGS_INSTANTIATE

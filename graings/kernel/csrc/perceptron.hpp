@@ -6,22 +6,28 @@
 namespace graings {
 
 // `widths` has one entry per level, input first; weights[l] is [widths[l + 1], widths[l]] row by row. ReLU
-// between layers, none after the last.
+// between layers, none after the last. Rows may come in groups, ascending, that each add a share of `shared`
+// [groups, widths[1]] to the first layer: what all rows of a group have in common is then multiplied once.
 template <class R>
 struct Network {
     std::vector<int64_t> widths;
     std::vector<const R*> weights, biases;
+    const R* shared = nullptr;
+    const int64_t* group = nullptr;  // of each row
+    int64_t groups = 0;
 };
 
 // Elements that the hidden activations of so many rows take.
 int64_t hidden_size(const std::vector<int64_t>& widths, int64_t rows);
 
 // output [rows, widths.back()] of input [rows, widths.front()]. `hidden` may be null when no gradient is wanted.
+// Throws std::invalid_argument where groups do not ascend within their count.
 template <class R>
 void evaluate(const Network<R>&, int64_t rows, const R* input, R* output, R* hidden, int threads);
 
-// Gradients for `v_output`, with `hidden` as evaluate left it; `v_input` may be null. The same bits for any number of threads.
+// Gradients for `v_output`, with `hidden` as evaluate left it; `v_input` may be null, and `v_shared` where
+// nothing is shared. The same bits for any number of threads.
 template <class R>
-void differentiate(const Network<R>&, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, int threads);
+void differentiate(const Network<R>&, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, R* v_shared, int threads);
 
 }  // namespace graings

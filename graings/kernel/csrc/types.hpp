@@ -142,6 +142,10 @@ struct NetworkArgs {
     const R* biases[kMaxLayers];
     const R *input, *v_output;
     R *output, *v_input;  // v_input may be null
+    const R* shared;        // [groups, widths[1]], added to the first layer of the rows of a group; or null
+    const int64_t* groups;  // of each row, ascending
+    R* v_shared;
+    int64_t first_group_at;  // in a set of partial sums: the part of a group that began in the piece before
     R* hidden;            // the hidden levels of every block, kept for the gradient; null where none is wanted
 };
 
