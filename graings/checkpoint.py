@@ -13,23 +13,22 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from graings.camera import Camera, View
-from graings.config import SceneConfig, TrainConfig, restored
+from graings.camera import View
+from graings.config import TrainConfig
 from graings.errors import CheckpointError
+from graings.model import Model, model_facts, model_from
 from graings.run_folder import BEST, CHECKPOINTS, FACTS_FILE, checkpoints
 from graings.run_folder import best_checkpoint as best_checkpoint  # part of this module's interface too
 from graings.run_folder import newest_checkpoint as newest_checkpoint
-from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.units import Units
 
@@ -41,31 +40,11 @@ _STATE_FILE = "state.safetensors"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Model:
-    """A trained scene with what is needed to look at it: units, background and the capture's views."""
-
-    scene: Scene
-    units: Units
-    background: tuple[float, float, float]
-    views: Mapping[str, tuple[View, ...]]
-    config: TrainConfig
-    iteration: int
-    finished: bool
-    digest: str
-    path: Path
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class TrainingState:
     """What only the trainer needs: tensors and JSON facts, opaque to this module."""
 
     tensors: dict[str, Tensor]
     facts: dict[str, Any]
-
-
-def scene_bytes(scene: Scene) -> int:
-    """Bytes of everything needed to render, float32 (decision 22); uids break ties and count."""
-    return sum(t.numel() * t.element_size() for t in scene.state_dict().values())
 
 
 def save_checkpoint(
@@ -99,15 +78,16 @@ def save_checkpoint(
         digest = hashlib.sha256((part / _SCENE_FILE).read_bytes()).hexdigest()
         facts = {
             "format": FORMAT,
-            "iteration": iteration,
-            "finished": finished,
             "digest": digest,
-            "temporal": scene.temporal,
-            "scene_config": scene.config.model_dump(mode="json"),
-            "config": config.model_dump(mode="json"),
-            "units": asdict(units),
-            "background": list(background),
-            "views": {split: [_view_to_json(view) for view in members] for split, members in views.items()},
+            **model_facts(
+                scene=scene,
+                units=units,
+                background=background,
+                views=views,
+                config=config,
+                iteration=iteration,
+                finished=finished,
+            ),
             "state": state.facts,
         }
         (part / FACTS_FILE).write_text(json.dumps(facts, allow_nan=False))
@@ -140,24 +120,7 @@ def load_model(path: Path) -> Model:
     folder = _resolve(path)
     facts = _read_facts(folder)
     try:
-        config = restored(TrainConfig, facts["config"], folder)
-        # Where the checkpoint does not say how time enters, it is older than the other way.
-        shape = restored(SceneConfig, {"deform_time": "input"} | facts["scene_config"], folder)
-        scene = _scene_from(load_file(folder / _SCENE_FILE), shape, facts["temporal"])
-        units = facts["units"]
-        return Model(
-            scene=scene,
-            units=Units(
-                tuple(units["center"]), units["scale"], units["time_start"], units["time_span"], tuple(units["up"])
-            ),
-            background=tuple(facts["background"]),
-            views={split: tuple(map(_view_from_json, views)) for split, views in facts["views"].items()},
-            config=config,
-            iteration=facts["iteration"],
-            finished=facts["finished"],
-            digest=facts["digest"],
-            path=folder,
-        )
+        return model_from(facts, load_file(folder / _SCENE_FILE), facts["digest"], folder)
     except (OSError, SafetensorError, ValidationError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(f"{folder}: damaged checkpoint ({error}). Use an earlier one or train again.") from error
 
@@ -192,14 +155,6 @@ def _read_facts(folder: Path) -> dict[str, Any]:
     return facts
 
 
-def _scene_from(tensors: dict[str, Tensor], config: SceneConfig, temporal: bool) -> Scene:
-    rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
-    scene = Scene(config, Scaffold(**rows), extent=float(tensors["extent"]), initial_opacity=0.1)
-    scene.load_state_dict(tensors)
-    scene.temporal = temporal
-    return scene
-
-
 def _contiguous(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor.detach().contiguous().clone() for name, tensor in tensors.items()}
 
@@ -210,19 +165,3 @@ def _flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _view_to_json(view: View) -> dict[str, Any]:
-    camera = view.camera
-    return {
-        "name": view.name,
-        "time": view.time,
-        "world_to_camera": camera.world_to_camera.tolist(),
-        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
-        "size": [camera.width, camera.height],
-    }
-
-
-def _view_from_json(facts: dict[str, Any]) -> View:
-    camera = Camera(np.array(facts["world_to_camera"]), *facts["intrinsics"], *facts["size"])
-    return View(facts["name"], camera, facts["time"])

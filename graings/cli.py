@@ -23,12 +23,13 @@ from rich.table import Table
 from rich.text import Text
 
 from graings.camera import Camera
-from graings.checkpoint import Model, load_model
 from graings.cli_training import Lists, Threads, ablate, train
+from graings.compact import SUFFIX, open_model, write_compact
 from graings.config import Part, make_config, options
 from graings.encode import encode_image, image_format
 from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
 from graings.evaluation import evaluate_run
+from graings.model import Model, scene_bytes
 from graings.render import render
 from graings.report_folder import report_runs
 from graings.terminal import metrics_line, say
@@ -114,7 +115,7 @@ def render_view(
     try:
         format = image_format(output.suffix)
         rgb = background_rgb(background) if background is not None else None
-        model = load_model(run)
+        model = open_model(run)
         if camera is not None:
             named = named_view(model.views, camera)
             view, own_time = sized(named.camera, width, height), named.time
@@ -134,6 +135,17 @@ def render_view(
     milliseconds = 1e3 * (time.perf_counter() - started)
     output.write_bytes(encode_image(result.color.numpy(), format))
     say(f"{output}: {view.width} x {view.height} at t = {moment:g}, drawn in {milliseconds:.0f} ms.")
+
+
+@app.command()
+def export(
+    run: Run,
+    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write, such as scene{SUFFIX}.")],
+) -> None:
+    """Write a model as one small file that `graings render` takes in place of the run."""
+    model = open_model(run)
+    size = write_compact(model, output)
+    say(f"{output}: {size / 1e6:.2f} MB, {scene_bytes(model.scene) / 1e6:.2f} MB in float32.")
 
 
 @app.command()

@@ -19,8 +19,8 @@ from torch.nn import functional
 
 from graings import kernel
 from graings.camera import View
-from graings.checkpoint import Model
 from graings.machine import machine_facts, version_facts
+from graings.model import Model
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
 from graings.render import draw
 from graings.scene.scene import Composition

@@ -115,6 +115,7 @@ class Job:
     progress: dict[str, Any] | None
     checkpoint: int | None
     has_metrics: bool
+    has_model: bool
     error: str | None
 
 

@@ -105,5 +105,6 @@ class JobQueue:
             progress=last_progress(folder.progress),
             checkpoint=folder.checkpoint(),
             has_metrics=folder.metrics.exists(),
+            has_model=folder.model.exists(),
             error=None if ticket is None else ticket.error,
         )

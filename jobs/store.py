@@ -62,6 +62,10 @@ class JobFolder:
     def report(self) -> Path:
         return self.run / "report"
 
+    @property
+    def model(self) -> Path:
+        return self.run / "model.graings"
+
     def spec(self) -> JobSpec:
         return JobSpec(**self._record()["spec"])
 

@@ -15,9 +15,10 @@ import numpy as np
 from anyio import CapacityLimiter, to_thread
 
 from graings.camera import Camera
-from graings.checkpoint import Model, load_model, newest_checkpoint
+from graings.checkpoint import load_model, newest_checkpoint
 from graings.encode import ImageFormat, encode_image
 from graings.errors import CheckpointError
+from graings.model import Model
 from graings.render import render
 from service.problems import Busy
 

@@ -78,6 +78,8 @@ def job_resource(job: Job) -> JobResource:
         links["render"] = f"/render?job={job.id}"
     if job.has_metrics:
         links |= {"metrics": f"{base}/metrics", "curve": f"{base}/curve.svg", "report": f"{base}/report"}
+    if job.has_model:
+        links["model"] = f"{base}/model"
     return JobResource(
         id=job.id,
         name=job.spec.name,

@@ -50,7 +50,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.render_plot": ("graings.drawing", "graings.plots"),
     "graings.picture": (),
     "graings.render_precision": (
-        *("graings.camera", "graings.checkpoint", "graings.kernel", "graings.machine", "graings.raster.result"),
+        *("graings.camera", "graings.kernel", "graings.machine", "graings.model", "graings.raster.result"),
         *("graings.render", "graings.scene", "graings.work_precision"),
     ),
     "graings.report_folder": (
@@ -59,9 +59,12 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     "graings.plan": ("graings.capture.capture", "graings.config"),
     "graings.run_folder": ("graings.errors",),
+    "graings.model": ("graings.camera", "graings.config", "graings.scene", "graings.units"),
     "graings.checkpoint": (
-        *("graings.camera", "graings.config", "graings.errors", "graings.run_folder", "graings.scene", "graings.units"),
+        *("graings.camera", "graings.config", "graings.errors", "graings.model", "graings.run_folder"),
+        *("graings.scene", "graings.units"),
     ),
+    "graings.compact": ("graings.checkpoint", "graings.constants", "graings.errors", "graings.model", "graings.scene"),
     "graings.evaluation": (
         *("graings.capture", "graings.checkpoint", "graings.errors", "graings.metrics", "graings.render"),
         *("graings.report", "graings.scene"),
@@ -71,7 +74,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.camera", "graings.checkpoint", "graings.config", "graings.constants", "graings.errors"),
         *("graings.evaluation", "graings.machine", "graings.metrics", "graings.plan", "graings.report"),
         *("graings.gaussians", "graings.run_folder", "graings.units", "graings.threads"),
-        *("graings.report_folder", "graings.seeds", "graings.work_precision"),
+        *("graings.compact", "graings.model", "graings.report_folder", "graings.seeds", "graings.work_precision"),
     ),
     # Many runs. The table and its drawing know numbers, not runs.
     "graings.ablation": (),
@@ -91,8 +94,15 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.terminal", "graings.training.run"),
     ),
     "graings.cli": (
-        *("graings.camera", "graings.checkpoint", "graings.cli_training", "graings.config", "graings.encode"),
-        *("graings.errors", "graings.evaluation", "graings.render", "graings.report_folder", "graings.terminal"),
+        *("graings.camera", "graings.cli_training", "graings.compact", "graings.config", "graings.encode"),
+        *(
+            "graings.errors",
+            "graings.evaluation",
+            "graings.model",
+            "graings.render",
+            "graings.report_folder",
+            "graings.terminal",
+        ),
         *("graings.threads", "graings.viewpoint", "graings.work_precision"),
     ),
     "graings.__main__": ("graings.cli",),
@@ -104,7 +114,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     # HTTP never trains.
     "service": (
         *("service", "jobs", "graings", "graings.camera", "graings.checkpoint", "graings.config", "graings.encode"),
-        *("graings.errors", "graings.render", "graings.threads", "graings.units", "graings.viewpoint"),
+        *("graings.errors", "graings.model", "graings.render", "graings.threads", "graings.units", "graings.viewpoint"),
     ),
     "service.demo": ("service", "jobs", "graings.capture.synthetic", "graings.errors"),
 }
@@ -124,7 +134,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "pycolmap": ("graings.capture",),
     "lpips": ("graings.metrics",),
     "matplotlib": ("graings.picture",),
-    "safetensors": ("graings.checkpoint",),
+    "safetensors": ("graings.checkpoint", "graings.compact"),
 }
 
 # Optional extras: heavy, or absent from most machines.

@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 
 from graings.camera import Camera, View
-from graings.checkpoint import Model, TrainingState, load_model, save_checkpoint
+from graings.checkpoint import TrainingState, load_model, save_checkpoint
 from graings.cli import main
 from graings.config import make_config
 from graings.errors import CheckpointError
+from graings.model import Model
 from graings.render_precision import render_part, settings
 from graings.report_folder import report_runs, report_training
 from graings.units import Units

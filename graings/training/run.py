@@ -25,13 +25,14 @@ from graings.checkpoint import (
     load_state,
     newest_checkpoint,
     save_checkpoint,
-    scene_bytes,
 )
+from graings.compact import SUFFIX, read_compact, write_compact
 from graings.config import TrainConfig, restored
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation import evaluate, frames_per_second, subset
 from graings.machine import machine_facts, version_facts
 from graings.metrics import Lpips, SplitMetrics
+from graings.model import scene_bytes
 from graings.plan import Plan, make_plan
 from graings.report import METRICS_SCHEMA, config_hash, curve_svg, read_metrics, write_metrics, write_text
 from graings.report_folder import report_training
@@ -42,6 +43,9 @@ from graings.training.trainer import StepReport, Trainer
 from graings.work_precision import run_names
 
 SCHEMA = "graings.run/1"
+
+# The model alone, small, as it is given away.
+COMPACT_FILE = f"model{SUFFIX}"
 
 # Frames per second are measured on this many views.
 FPS_VIEWS = 8
@@ -284,8 +288,19 @@ class TrainingRun:
             self._clock.add("evaluation", time.perf_counter() - started)
         splits = self._splits()
         self._save(finished=True)
-        self._write_metrics(splits)
+        self._write_metrics(splits, self._export())
         return point
+
+    def _export(self) -> dict[str, Any]:
+        """Write the newest checkpoint as one small file: its name, its bytes, and the PSNR it has on all of val."""
+        started = time.perf_counter()
+        size = write_compact(load_model(self.folder), self.folder / COMPACT_FILE)
+        psnr = None
+        if self.capture.val:
+            scene, background = read_compact(self.folder / COMPACT_FILE).scene, self.config.capture.background_rgb()
+            psnr = evaluate(scene, self.capture.val, self.images, background).psnr
+        self._clock.add("evaluation", time.perf_counter() - started)
+        return {"file": COMPACT_FILE, "bytes": size, "psnr": psnr}
 
     def _splits(self) -> dict[str, Any]:
         """Metrics of all of val, as a finished run reports them."""
@@ -316,7 +331,7 @@ class TrainingRun:
                 self._last_gaussians = int(state.facts["gaussians"])
         splits = self._splits()
         self._save(instead_of_later=True)
-        self._write_metrics(splits)
+        self._write_metrics(splits, self._export())
 
     def _is_complete(self) -> bool:
         """Whether the metrics document is that of the last iteration."""
@@ -342,7 +357,7 @@ class TrainingRun:
         write_metrics(self.folder / "run.json", document)
         self._clock.add("report", time.perf_counter() - started)
 
-    def _write_metrics(self, splits: dict[str, Any]) -> None:
+    def _write_metrics(self, splits: dict[str, Any], compact: dict[str, Any] | None = None) -> None:
         started = time.perf_counter()
         scene, background = self._trainer.scene, self.config.capture.background_rgb()
         fps = frames_per_second(scene, subset(self.capture.train, FPS_VIEWS), background)
@@ -359,7 +374,8 @@ class TrainingRun:
             "iterations": self.iteration,
             "gaussians": self._last_gaussians,
             "anchors": scene.scaffold.count,
-            "bytes": {"fp32": scene_bytes(scene), "compact": None},
+            "bytes": {"fp32": scene_bytes(scene), "compact": None if compact is None else compact["bytes"]},
+            "compact": compact,
             "render_fps": fps,
             "curve": self._curve,
             "events": self._events,

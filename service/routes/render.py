@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 import graings
 from graings.camera import Camera, View
-from graings.checkpoint import Model
 from graings.encode import FORMATS, MEDIA_TYPES, ImageFormat
+from graings.model import Model
 from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
 from service.context import Context, Here
 from service.negotiation import preferred

@@ -54,6 +54,13 @@ def report_picture(job_id: JobId, here: Here) -> Response:
     return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
 
 
+@router.get("/model", operation_id="get_model", response_class=FileResponse)
+def model(job_id: JobId, here: Here) -> Response:
+    """The trained model as one small file, for `graings render`."""
+    path = _existing(here.store.folder(job_id).model, "model", "It comes when training ends.")
+    return FileResponse(path, media_type="application/octet-stream", filename=f"{job_id}.graings")
+
+
 @router.get("/log", operation_id="get_log", response_class=PlainTextResponse)
 def log(job_id: JobId, here: Here, tail: Annotated[int, Query(ge=1, le=100_000)] = 1_000) -> Response:
     """The last `tail` lines of the trainer's log."""

@@ -156,7 +156,7 @@ function facts(job) {
     curve.dataset.stamp = stamp;
     curve.src = `${job.links.curve}?at=${Date.now()}`;
   }
-  const names = { metrics: "metrics.json", report: "report", log: "log" };
+  const names = { model: "model", metrics: "metrics.json", report: "report", log: "log" };
   $("files").replaceChildren(
     ...Object.entries(names).filter(([key]) => job.links[key]).map(([key, text]) => element("a", { href: job.links[key] }, text)),
   );

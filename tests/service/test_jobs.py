@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
+from graings.compact import read_compact
 from jobs.engine import Engine
 from jobs.store import JobFolder
 from service.app import create_app
@@ -128,14 +129,14 @@ def test_steering_follows_the_state_and_may_be_repeated(client: TestClient, job:
         problem(answer, 404)
 
 
-@pytest.mark.parametrize("path", ["", "/metrics", "/log", "/events", "/curve.svg", "/report", "/report.svg"])
+@pytest.mark.parametrize("path", ["", "/metrics", "/log", "/events", "/curve.svg", "/report", "/report.svg", "/model"])
 @pytest.mark.parametrize("job_id", ["0123456789abcdef", "..%2f..%2fetc", "x"])
 def test_an_unknown_job_is_a_404_everywhere(client: TestClient, job_id: str, path: str) -> None:
     problem(client.get(f"/jobs/{job_id}{path}"), 404)
 
 
 def test_metrics_and_curve_come_when_there_are_any(client: TestClient, job: str, folder: JobFolder) -> None:
-    for path in ("metrics", "curve.svg", "report", "report.svg"):
+    for path in ("metrics", "curve.svg", "report", "report.svg", "model"):
         assert problem(client.get(f"/jobs/{job}/{path}"), 404)["type"] == "urn:graings:problem:not-yet"
         assert path.split(".")[0] not in client.get(f"/jobs/{job}").json()["links"]
 
@@ -152,6 +153,14 @@ def test_metrics_and_curve_of_a_trained_job(client: TestClient, model: str) -> N
         picture = client.get(address)
         assert picture.headers["content-type"] == "image/svg+xml"
         assert "<svg" in picture.text
+
+
+def test_the_model_of_a_trained_job_is_a_file_that_renders(client: TestClient, model: str, tmp_path: Path) -> None:
+    answer = client.get(client.get(f"/jobs/{model}").json()["links"]["model"])
+    assert f'filename="{model}.graings"' in answer.headers["content-disposition"]
+    file = tmp_path / "scene.graings"
+    file.write_bytes(answer.content)
+    assert len(read_compact(file).views["train"]) > 0
 
 
 def test_the_log_shows_its_last_lines(client: TestClient, job: str, folder: JobFolder) -> None:

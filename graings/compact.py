@@ -1,0 +1,108 @@
+"""Compact: a model as one small file that is enough to render it.
+
+What anchors carry is rounded to half precision (an offset by a thousandth of its anchor's size at most), anchors that
+no time and no camera can show are left out, birth numbers become ranks, and the whole is compressed. Networks and
+anchor positions stay as they are. Knows nothing of training.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import zlib
+from pathlib import Path
+from typing import Final
+
+import torch
+from jaxtyping import Bool
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from graings import constants
+from graings.checkpoint import load_model
+from graings.errors import CheckpointError
+from graings.model import Model, model_facts, model_from
+from graings.scene.scaffold import Scaffold
+from graings.scene.scene import Scene
+
+FORMAT: Final = "graings.model/1"
+SUFFIX: Final = ".graings"
+
+_FACTS: Final = "graings"
+
+# Rows of the scaffold that half precision is enough for.
+_HALVED: Final = ("log_scales", "features", "offsets", "opacity_offsets")
+
+
+def write_compact(model: Model, path: Path) -> int:
+    """Write `model` to the file `path`, whole or not at all; returns its size in bytes.
+
+    Raises `CheckpointError` where the file cannot be written.
+    """
+    tensors = {name: tensor.detach() for name, tensor in model.scene.state_dict().items()}
+    order = tensors["scaffold.uids"].argsort()
+    order = order[can_be_seen(model.scene)[order]]
+    for name in Scaffold.ROWS:
+        rows = tensors[f"scaffold.{name}"][order]
+        tensors[f"scaffold.{name}"] = rows.half() if name in _HALVED else rows
+    # Ties between Gaussians are broken by the order of birth, which their order in the file keeps.
+    del tensors["scaffold.uids"]
+    facts = model_facts(
+        scene=model.scene,
+        units=model.units,
+        background=model.background,
+        views=model.views,
+        config=model.config,
+        iteration=model.iteration,
+        finished=model.finished,
+    )
+    plain = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    # One entry, because the library orders several by chance.
+    data = save(plain, {_FACTS: json.dumps({"format": FORMAT, **facts}, allow_nan=False)})
+    packed = gzip.compress(data, mtime=0)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_bytes(packed)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise CheckpointError(f"{path}: cannot write the model ({error.strerror}). Name another place.") from error
+    return len(packed)
+
+
+def read_compact(path: Path) -> Model:
+    """The model in the file `path`, in float32. Raises `CheckpointError`."""
+    try:
+        packed = path.read_bytes()
+        data = gzip.decompress(packed)
+        size = int.from_bytes(data[:8], "little")
+        facts = json.loads(json.loads(data[8 : 8 + size])["__metadata__"][_FACTS])
+        if facts["format"] != FORMAT:
+            raise CheckpointError(f"{path}: not in the format {FORMAT}. It was written by another version.")
+        tensors = load(data)
+        for name in _HALVED:
+            tensors[f"scaffold.{name}"] = tensors[f"scaffold.{name}"].float()
+        tensors["scaffold.uids"] = torch.arange(len(tensors["scaffold.anchors"]))
+        return model_from(facts, tensors, hashlib.sha256(packed).hexdigest(), path)
+    except (OSError, EOFError, zlib.error, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{path}: no model, or a damaged one ({error}). Export it again.") from error
+
+
+def open_model(path: Path) -> Model:
+    """The model in a file of `write_compact`, or in a run or checkpoint folder. Raises `CheckpointError`."""
+    return read_compact(path) if path.is_file() else load_model(path)
+
+
+def can_be_seen(scene: Scene) -> Bool[Tensor, " anchor"]:
+    """Which anchors have a child that may be drawn at some time from somewhere; the others never change a pixel."""
+    if scene.config.opacity_view:
+        return torch.ones(scene.scaffold.count, dtype=torch.bool)
+    with torch.no_grad():
+        features = scene.scaffold.features
+        logits = scene.appearance.opacity_logits(features, torch.zeros_like(scene.scaffold.anchors))
+        highest = torch.tanh(logits + scene.scaffold.opacity_offsets.unsqueeze(-1)).amax(-1)
+    # The residual is bounded; a hundredth of its bound covers what half precision does to a score.
+    reach = 1.01 * scene.residual.scale if scene.residual is not None else 0.0
+    return highest > constants.ALPHA_MIN - reach

@@ -1,0 +1,101 @@
+"""A model as one small file: smaller, the same pictures, and a clear word where it is none."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from graings import constants
+from graings.capture.synthetic import write_synthetic
+from graings.checkpoint import load_model
+from graings.compact import can_be_seen, open_model, read_compact, write_compact
+from graings.config import make_config
+from graings.errors import CheckpointError
+from graings.model import scene_bytes
+from graings.render import render
+from graings.training.run import TrainingRun
+from tests.models import EYE, tiny_scene
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("compact")
+    capture = write_synthetic(folder / "capture", seed=1, frames=10, size=32, bodies=2)
+    options = {"iterations": 40, "init.points": 30_000, "init.voxel_size": 0.02, "scene.children": 4, "threads": 1}
+    list(TrainingRun.create(capture, folder / "run", make_config("draft", options)))
+    return folder / "run"
+
+
+def test_a_compact_model_shows_the_same_pictures_in_half_the_bytes(run: Path, tmp_path: Path) -> None:
+    model = load_model(run)
+    size = write_compact(model, tmp_path / "scene.graings")
+    assert size == (tmp_path / "scene.graings").stat().st_size
+    assert size < 0.6 * scene_bytes(model.scene)
+    small = open_model(tmp_path / "scene.graings")
+    for view in model.views["val"]:
+        expected = render(model.scene, view.camera, view.time, model.background).color
+        found = render(small.scene, view.camera, view.time, small.background).color
+        assert (found - expected).square().mean() < 1e-6  # 60 dB
+
+
+def test_everything_beside_the_tensors_comes_back_as_it_was(run: Path, tmp_path: Path) -> None:
+    model = load_model(run)
+    write_compact(model, tmp_path / "scene.graings")
+    small = read_compact(tmp_path / "scene.graings")
+    assert (small.units, small.background, small.config) == (model.units, model.background, model.config)
+    assert (small.iteration, small.finished) == (model.iteration, True)
+    assert small.scene.temporal == model.scene.temporal
+    assert [view.name for view in small.views["test"]] == [view.name for view in model.views["test"]]
+    again = tmp_path / "again.graings"
+    write_compact(small, again)
+    assert again.read_bytes() == (tmp_path / "scene.graings").read_bytes()
+
+
+def test_a_run_leaves_its_compact_model_with_its_size_and_quality(run: Path) -> None:
+    metrics = TrainingRun.resume(run).metrics_path.read_text()
+    assert '"compact"' in metrics
+    document = json.loads(metrics)
+    assert document["bytes"]["compact"] == (run / document["compact"]["file"]).stat().st_size
+    assert document["compact"]["psnr"] == pytest.approx(document["splits"]["val"]["psnr"], abs=0.05)
+
+
+@pytest.mark.parametrize("residual", [True, False])
+def test_only_anchors_that_nothing_can_show_are_left_out(residual: bool) -> None:
+    scene = tiny_scene(anchors=300, residual=residual)
+    with torch.no_grad():
+        scene.scaffold.opacity_offsets.copy_(torch.linspace(-1.5, 0.5, 300))
+    kept = can_be_seen(scene)
+    assert 0 < int(kept.sum()) < 300
+    for time in torch.linspace(0, 1, 21).tolist():
+        shown = scene.compose(EYE, time).opacities.amax(-1) > constants.ALPHA_MIN
+        assert not (shown & ~kept).any()
+
+
+def test_an_opacity_that_depends_on_the_view_leaves_nothing_out() -> None:
+    assert can_be_seen(tiny_scene(opacity_view=True)).all()
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"no gzip", gzip.compress(b"no tensors"), gzip.compress(b"\x02" + bytes(7) + b"{}")]
+)
+def test_a_file_that_is_no_model_is_named(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "scene.graings"
+    file.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"scene\.graings: no model, or a damaged one"):
+        open_model(file)
+
+
+def test_a_cut_off_file_is_named_and_a_full_disk_leaves_the_old_one(run: Path, tmp_path: Path) -> None:
+    model = load_model(run)
+    file = tmp_path / "scene.graings"
+    write_compact(model, file)
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-100])
+    with pytest.raises(CheckpointError, match="damaged"):
+        open_model(file)
+    with pytest.raises(CheckpointError, match="cannot write the model"):
+        write_compact(model, tmp_path / "absent" / "scene.graings")
