@@ -270,3 +270,15 @@ def test_a_verb_that_cannot_be_loaded_says_so_when_it_is_used_and_not_before(
     capsys.readouterr()
     assert graings("float", "--high", "up") == 69
     assert "package_that_is_not_there" in capsys.readouterr().err
+
+
+def test_an_exported_model_renders_like_its_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "scene.graings"
+    assert graings("export", run, "-o", file) == 0
+    assert f"{file.stat().st_size / 1e6:.2f} MB" in capsys.readouterr().out
+    for model, name in ((run, "run.png"), (file, "file.png")):
+        assert graings("render", model, "--camera", "val:1", "-o", tmp_path / name) == 0
+    assert np.abs(pixels(tmp_path / "run.png") - pixels(tmp_path / "file.png")).max() < 0.02
+    file.write_bytes(b"no model")
+    assert graings("render", file, "-o", tmp_path / "view.png") == 65
+    assert "Export it again" in capsys.readouterr().err
