@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from graings.capture.capture import Capture, Frame
 from graings.capture.images import ImageStore
@@ -162,7 +163,7 @@ class Trainer:
             events.append(f"skipped: {verdict.culprit} was not finite on {frame.name} at t = {frame.time:.4g}")
         events += self._adapt()
         events += self._watch(len(composition.children), float(loss.detach()))
-        mse = float((result.color.detach() - target).square().mean())
+        mse = float(functional.mse_loss(result.color.detach(), target))
         return StepReport(
             iteration=self.iteration,
             iterations=self.config.iterations,

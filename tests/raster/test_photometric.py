@@ -93,6 +93,48 @@ def test_identical_images_have_similarity_one() -> None:
     assert gradient.abs().max().item() < 1e-12
 
 
+@pytest.mark.parametrize("level", [1.0, 0.5, None])  # a flat surrounding, or one with structure
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [
+        ((0, 1), (0, 1)),
+        ((20, 31), (15, 40)),
+        ((59, 60), (0, 50)),
+        ((0, 60), (49, 50)),
+        ((8, 9), (30, 31)),
+        ((30, 30), (0, 0)),
+    ],
+)
+def test_what_is_equal_is_left_out_and_changes_nothing(
+    rows: tuple[int, int], columns: tuple[int, int], level: float | None, isa: str
+) -> None:
+    image, target = pair(60, 50)
+    if level is not None:
+        target = torch.full_like(target, level)
+    different = torch.zeros(60, 50, 1, dtype=torch.bool)
+    different[slice(*rows), slice(*columns)] = True
+    image = torch.where(different, image, target)
+    for ours, plain in (
+        (ssim, photometric_reference.ssim),
+        (lambda x, y: photometric(x, y, 0.2), lambda x, y: photometric_reference.photometric(x, y, 0.2)),
+    ):
+        value, gradient = with_gradient(ours, image, target)
+        expected, expected_gradient = with_gradient(plain, image, target)
+        torch.testing.assert_close(value, expected, rtol=0, atol=1e-12)
+        # The oracle's own rounding where nothing differs: 24 moments <= 1 through the smallest divisor C2, in float64.
+        noise = 24 * 2.0**-53 / photometric_reference.C2 / image.numel()
+        assert ((gradient - expected_gradient).abs() <= 1e-12 * expected_gradient.abs().max() + noise).all()
+
+
+def test_a_number_that_is_none_is_a_difference() -> None:
+    image, _ = pair(40, 40)
+    target = image.clone()
+    image[20, 20, 1] = torch.nan
+    value, gradient = with_gradient(ssim, image, target)
+    assert value.isnan()
+    assert gradient[20, 20].isnan().any()
+
+
 def test_gradcheck_passes() -> None:
     image, target = pair(6, 5)
     assert torch.autograd.gradcheck(lambda x: ssim(x, target), image.clone().requires_grad_())

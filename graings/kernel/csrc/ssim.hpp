@@ -50,8 +50,8 @@ static void ssim_values(const SsimArgs<R>& args, int64_t band, int64_t begin, in
             P<R> sx = p16(R(0)), sy = sx, sxx = sx, syy = sx, sxy = sx;
             for (int64_t k = top; k <= bottom; k++) {
                 const P<R> tap = p16(R(kTaps[k < 0 ? -k : k]));
-                const P<R> a = load_some(args.image + (y + k) * length + x, length - x);
-                const P<R> b = load_some(args.target + (y + k) * length + x, length - x);
+                const P<R> a = load_some(args.image + (y + k) * args.row + x, length - x);
+                const P<R> b = load_some(args.target + (y + k) * args.row + x, length - x);
                 const P<R> ta = tap * a, tb = tap * b;
                 sx = sx + ta, sy = sy + tb, sxx = fma(ta, a, sxx), syy = fma(tb, b, syy), sxy = fma(ta, b, sxy);
             }
@@ -69,7 +69,7 @@ static void ssim_values(const SsimArgs<R>& args, int64_t band, int64_t begin, in
             const P<R> b1 = fma(mx, mx, fma(my, my, p16(c1))), b2 = max(vx, zero) + vy + p16(c2);
             const P<R> inverse = one / (b1 * b2), raw = a1 * a2 * inverse;
             R lanes[kLanes], differences[kLanes];
-            const P<R> difference = load_some(args.image + y * length + x, length - x) - load_some(args.target + y * length + x, length - x);
+            const P<R> difference = load_some(args.image + y * args.row + x, length - x) - load_some(args.target + y * args.row + x, length - x);
             store(lanes, clamp(raw, zero - one, one)), store(differences, max(difference, zero - difference));
             const int64_t n = length - x < kLanes ? length - x : kLanes;
             for (int64_t i = 0; i < n; i++) total += double(lanes[i]), apart += double(differences[i]);
@@ -104,7 +104,7 @@ static void ssim_gradient(const SsimArgs<R>& args, int64_t begin, int64_t end, R
         }
         for (int64_t x = 0; x < length; x += kLanes) {
             const R* in = scratch + kPad + x;
-            const int64_t at = y * length + x, n = length - x;
+            const int64_t at = y * args.row + x, n = length - x;
             const P<R> image = load_some(args.image + at, n), target = load_some(args.target + at, n);
             const P<R> g = fma(p16(R(2)) * image, across(in + stride), fma(target, across(in + 2 * stride), across(in)));
             const P<R> sign = select(target < image, absolute, select(image < target, zero - absolute, zero));

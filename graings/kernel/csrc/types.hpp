@@ -119,6 +119,7 @@ struct GeometryGradientArgs {
 template <class R>
 struct SsimArgs {
     int64_t height, width;
+    int64_t row;    // numbers from one row of image, target and gradient to the next
     const R *image, *target;
     R* gradient;    // [height, width, 3] or null
     R* maps;        // three planes [height, width, 3]: what the gradient filters back
