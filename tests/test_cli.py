@@ -227,7 +227,7 @@ def test_options_are_listed_with_value_bounds_and_help(
     monkeypatch.setenv("COLUMNS", "200")
     assert graings("options", "--preset", "draft") == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("density.max_anchors"))
-    assert line.split()[:4] == ["density.max_anchors", "6000", "≥", "16"]
+    assert line.split()[:4] == ["density.max_anchors", "1200", "≥", "16"]
     assert "Hard budget of anchors" in line
 
 

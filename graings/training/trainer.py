@@ -39,6 +39,9 @@ MIN_TEMPORAL_SAMPLE = 2_000
 # Every time training goes back, it goes on with this share of the rates.
 RATE_CUT = 0.5
 
+# With more of the anchors' budget taken than this, growth first removes those that show nothing.
+ROOM = 0.9
+
 # What the guard calls the gradients of the projected centres, which growth looks at.
 SCREEN = "screen"
 
@@ -226,13 +229,17 @@ class Trainer:
             events += self._grow()
         every = max(1, scaled(config.prune_every))
         if scaled(config.prune_from) <= self.iteration <= scaled(config.prune_until) and self.iteration % every == 0:
-            keep = density.prune(self.scene.scaffold, self.statistics, config)
-            removed = int((~keep).sum())
-            if removed:
-                self.optimizer.keep(keep)
-                self.statistics.resize(keep=keep)
-                events.append(f"pruned {removed} anchors")
+            events += self._prune()
         return events
+
+    def _prune(self) -> list[str]:
+        keep = density.prune(self.scene.scaffold, self.statistics, self.config.density)
+        removed = int((~keep).sum())
+        if removed == 0:
+            return []
+        self.optimizer.keep(keep)
+        self.statistics.resize(keep=keep)
+        return [f"pruned {removed} anchors"]
 
     def _watch(self, drawn: int, loss: float) -> list[str]:
         """Look after the scene's health and go back where it is lost; returns what happened, in words."""
@@ -320,6 +327,8 @@ class Trainer:
 
     def _grow(self) -> list[str]:
         scene, config = self.scene, self._density
+        # Anchors that show nothing would keep others from growing for good: what is not drawn does not come back.
+        events = self._prune() if scene.scaffold.count > ROOM * config.max_anchors else []
         growth = density.grow(
             scene.scaffold,
             self.statistics,
@@ -330,14 +339,15 @@ class Trainer:
             self.streams["growth"],
         )
         self.statistics.forget_grown(config.min_observations)
-        capped = ["growth_capped: the budget of anchors is used up or too many wanted to grow"] if growth.capped else []
+        if growth.capped:
+            events.append("growth_capped: the budget of anchors is used up or too many wanted to grow")
         if len(growth) == 0:
-            return capped
+            return events
         self.optimizer.append(growth.rows)
         self.statistics.resize(append=len(growth))
         self.next_uid += len(growth)
         self.guard.trend.grown()
-        return [f"grew {len(growth)} anchors", *capped]
+        return [f"grew {len(growth)} anchors", *events]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Everything beside the scene that the next step depends on: tensors and JSON."""

@@ -43,9 +43,9 @@ def test_static_step_leaves_temporal_parameters_and_moments_untouched() -> None:
 
 def test_phases_are_data() -> None:
     names = [(phase.name, phase.first, phase.last, phase.temporal) for phase in phases(TrainConfig(iterations=30_000))]
-    assert names == [("warmup", 1, 3000, False), ("joint", 3001, 30_000, True)]
+    assert names == [("warmup", 1, 1000, False), ("joint", 1001, 30_000, True)]
     shorter = [(phase.name, phase.last) for phase in phases(TrainConfig(iterations=1000))]
-    assert shorter == [("warmup", 100), ("joint", 1000)]
+    assert shorter == [("warmup", 33), ("joint", 1000)]
     static = TrainConfig.model_validate({"scene": {"deformation": "none", "residual": False}})
     assert [phase.name for phase in phases(static)] == ["static"]
     without = TrainConfig.model_validate({"scene": {"canonical": False}})

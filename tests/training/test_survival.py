@@ -246,6 +246,23 @@ def test_growth_without_end_stops_at_the_budget(micro: Path) -> None:
     assert finite(trainer)
 
 
+def test_anchors_that_show_nothing_make_room_for_growth(micro: Path) -> None:
+    growing = {"density.statistics_from": 0, "density.grow_from": 0, "density.grow_until": 30_000}
+    eager = {"density.grow_every": 10, "density.gradient_threshold": 1e-9, "density.prune_visits": 15}
+    trainer = micro_trainer(micro, **growing, **eager, **{"density.max_anchors": 60})
+    scaffold = trainer.scene.scaffold
+    count, showing = scaffold.count, 40
+    assert count > 60, "more anchors than the budget from the first step on, as a dense cloud gives"
+    with torch.no_grad():
+        scaffold.opacity_offsets[showing:] = -5.0
+    reports = steps(trainer, 60)
+    uids = set(trainer.scene.scaffold.uids.tolist())
+    assert said(reports, "pruned")
+    assert uids.isdisjoint(range(showing, count))
+    assert max(uids) >= count, "something was born in their place"
+    assert len(uids) <= 60
+
+
 def test_a_larger_scene_costs_more_of_the_budget() -> None:
     small, large = micro_config().scene, micro_config(**{"scene.children": 10, "scene.deform_width": 256}).scene
     assert bytes_per_anchor(large) > 3 * bytes_per_anchor(small)
