@@ -1,8 +1,8 @@
 """Compact: a model as one small file that is enough to render it.
 
-What anchors carry is rounded to half precision (an offset by a thousandth of its anchor's size at most), anchors that
-no time and no camera can show are left out, birth numbers become ranks, and the whole is compressed. Networks and
-anchor positions stay as they are. Knows nothing of training.
+What anchors carry is rounded to half precision where that can hold it, anchors that no time and no camera can show are
+left out, birth numbers become ranks, and the whole is compressed. Networks and anchor positions stay as they are. Knows
+nothing of training.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
+import os
 import zlib
 from pathlib import Path
 from typing import Final
@@ -46,7 +47,9 @@ def write_compact(model: Model, path: Path) -> int:
     order = order[can_be_seen(model.scene)[order]]
     for name in Scaffold.ROWS:
         rows = tensors[f"scaffold.{name}"][order]
-        tensors[f"scaffold.{name}"] = rows.half() if name in _HALVED else rows
+        halved = rows.half()
+        # Half precision ends at 65 504; what is larger must not become infinite.
+        tensors[f"scaffold.{name}"] = halved if name in _HALVED and bool(halved.isfinite().all()) else rows
     # Ties between Gaussians are broken by the order of birth, which their order in the file keeps.
     del tensors["scaffold.uids"]
     facts = model_facts(
@@ -62,7 +65,9 @@ def write_compact(model: Model, path: Path) -> int:
     # One entry, because the library orders several by chance.
     data = save(plain, {_FACTS: json.dumps({"format": FORMAT, **facts}, allow_nan=False)})
     packed = gzip.compress(data, mtime=0)
-    part = path.with_name(f".{path.name}.part")
+    if not path.name or path.is_dir():
+        raise CheckpointError(f"{path}: is a folder where a file is wanted. Name a file in it.")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")  # two may write at once; the last one stays
     try:
         part.write_bytes(packed)
         part.replace(path)

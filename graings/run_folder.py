@@ -15,6 +15,7 @@ from graings.errors import CheckpointError
 
 LOCK_FILE = ".training"
 CHECKPOINTS = "checkpoints"
+MODEL_FILE = "model.graings"  # the model alone, small, as it is given away
 BEST = "best"
 FACTS_FILE = "checkpoint.json"
 

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from graings.run_folder import newest_checkpoint
+from graings.run_folder import MODEL_FILE, newest_checkpoint
 from jobs.files import locked, write_json
 from jobs.job import Attempt, JobConflict, JobError, JobNotFound, JobSpec, check_id
 
@@ -64,7 +64,7 @@ class JobFolder:
 
     @property
     def model(self) -> Path:
-        return self.run / "model.graings"
+        return self.run / MODEL_FILE
 
     def spec(self) -> JobSpec:
         return JobSpec(**self._record()["spec"])

@@ -75,6 +75,34 @@ def test_only_anchors_that_nothing_can_show_are_left_out(residual: bool) -> None
         assert not (shown & ~kept).any()
 
 
+@pytest.mark.parametrize("huge", [3.0, 1e6])
+def test_what_half_precision_cannot_hold_stays_as_it_is(run: Path, tmp_path: Path, huge: float) -> None:
+    model = load_model(run)
+    with torch.no_grad():
+        model.scene.scaffold.offsets[0, 0, 0] = huge
+        model.scene.scaffold.opacity_offsets[0] = 3.0
+    write_compact(model, tmp_path / "scene.graings")
+    offsets = read_compact(tmp_path / "scene.graings").scene.scaffold.offsets.detach()
+    assert float(offsets[0, 0, 0]) == huge
+
+
+def test_a_model_of_which_nothing_shows_is_an_empty_picture(run: Path, tmp_path: Path) -> None:
+    model = load_model(run)
+    with torch.no_grad():
+        model.scene.scaffold.opacity_offsets.fill_(-5.0)
+    write_compact(model, tmp_path / "scene.graings")
+    small, view = read_compact(tmp_path / "scene.graings"), model.views["val"][0]
+    assert small.scene.scaffold.count == 0
+    picture = render(small.scene, view.camera, view.time, small.background).color
+    assert torch.equal(picture, torch.tensor(small.background).expand_as(picture))
+
+
+def test_a_folder_where_a_file_is_wanted_is_named(run: Path, tmp_path: Path) -> None:
+    for folder in (tmp_path, Path(".")):
+        with pytest.raises(CheckpointError, match="is a folder where a file is wanted"):
+            write_compact(load_model(run), folder)
+
+
 def test_an_opacity_that_depends_on_the_view_leaves_nothing_out() -> None:
     assert can_be_seen(tiny_scene(opacity_view=True)).all()
 

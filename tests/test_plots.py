@@ -114,7 +114,7 @@ def test_labels_of_equal_settings_do_not_cover_one_another() -> None:
 
 
 def test_a_picture_is_the_drawing_at_twice_its_size() -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason="PNG needs the extra plot")
     file = png(training_svg([run("a $x$", 20.0, 25.0), *(run(f"b{i}", 20.0) for i in range(8))]))
     assert file.startswith(b"\x89PNG")
     assert int.from_bytes(file[16:20]) == 2 * 1200

@@ -86,7 +86,7 @@ def test_a_small_budget_draws_fewer_views_but_every_setting(model: Model) -> Non
 
 
 def test_a_report_of_several_runs_is_complete(run: Path, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason="PNG needs the extra plot")
     bare = write_run(tmp_path / "bare", metrics(*CURVE))
     written = report_runs([run, bare], tmp_path / "report", budget_s=0.1)
     assert sorted(path.name for path in (tmp_path / "report").iterdir()) == sorted(written.files)

@@ -26,7 +26,7 @@ from graings.checkpoint import (
     newest_checkpoint,
     save_checkpoint,
 )
-from graings.compact import SUFFIX, read_compact, write_compact
+from graings.compact import read_compact, write_compact
 from graings.config import TrainConfig, restored
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation import evaluate, frames_per_second, subset
@@ -36,16 +36,13 @@ from graings.model import scene_bytes
 from graings.plan import Plan, make_plan
 from graings.report import METRICS_SCHEMA, config_hash, curve_svg, read_metrics, write_metrics, write_text
 from graings.report_folder import report_training
-from graings.run_folder import sole_trainer
+from graings.run_folder import MODEL_FILE, sole_trainer
 from graings.threads import use_threads
 from graings.training.pace import Clock, Rate, evaluation_marks
 from graings.training.trainer import StepReport, Trainer
 from graings.work_precision import run_names
 
 SCHEMA = "graings.run/1"
-
-# The model alone, small, as it is given away.
-COMPACT_FILE = f"model{SUFFIX}"
 
 # Frames per second are measured on this many views.
 FPS_VIEWS = 8
@@ -294,13 +291,13 @@ class TrainingRun:
     def _export(self) -> dict[str, Any]:
         """Write the newest checkpoint as one small file: its name, its bytes, and the PSNR it has on all of val."""
         started = time.perf_counter()
-        size = write_compact(load_model(self.folder), self.folder / COMPACT_FILE)
+        size = write_compact(load_model(self.folder), self.folder / MODEL_FILE)
         psnr = None
         if self.capture.val:
-            scene, background = read_compact(self.folder / COMPACT_FILE).scene, self.config.capture.background_rgb()
+            scene, background = read_compact(self.folder / MODEL_FILE).scene, self.config.capture.background_rgb()
             psnr = evaluate(scene, self.capture.val, self.images, background).psnr
         self._clock.add("evaluation", time.perf_counter() - started)
-        return {"file": COMPACT_FILE, "bytes": size, "psnr": psnr}
+        return {"file": MODEL_FILE, "bytes": size, "psnr": psnr}
 
     def _splits(self) -> dict[str, Any]:
         """Metrics of all of val, as a finished run reports them."""
