@@ -133,7 +133,10 @@ class DensityConfig(Part):
 
 
 class RatesConfig(Part):
-    """Adam learning rates, first and last (log-linear between). Owner: `graings.training.optimizer`."""
+    """Learning rates, first and last (log-linear between). Owner: `graings.training.optimizer`.
+
+    They are Adam's; `matrices` is that of the matrices in `static` and `deformation` unless `matrix_step` is adam.
+    """
 
     offsets: tuple[float, float] = (0.02, 2e-4)
     features: tuple[float, float] = (0.0075, 0.0075)
@@ -144,6 +147,7 @@ class RatesConfig(Part):
     opacity: tuple[float, float] = (0.002, 2e-5)
     residual: tuple[float, float] = (0.002, 2e-5)
     deformation: tuple[float, float] = (2e-3, 2e-4)
+    matrices: tuple[float, float] = (8e-3, 2e-4)
 
 
 class GuardConfig(Part):
@@ -178,6 +182,11 @@ class TrainConfig(Part):
     preset: Literal["draft", "standard", "paper"] = Field("standard", description="Where the defaults come from.")
     iterations: int = Field(15_000, ge=1, le=1_000_000, description="Optimisation steps.")
     warmup: int = Field(1_000, ge=0, description="Static warm-up T_w, of the 30 000 schedule; the paper has 3 000.")
+    matrix_step: Literal["muon", "adam"] = Field(
+        "muon",
+        description="How weight matrices of StaticMLP and DeformNet step. muon: orthogonalised momentum; adam: as the "
+        "rest.",
+    )
     seed: int = Field(0, ge=0, lt=2**31, description="Seed of every random stream.")
     threads: int | None = Field(None, ge=1, le=256, description="CPU threads; null takes all cores.")
     capture: CaptureConfig = CaptureConfig()

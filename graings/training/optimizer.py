@@ -1,4 +1,5 @@
-"""Optimizer: Adam over named groups with log-linear rates, and rows that come and go with the anchors.
+"""Optimizer: Adam over named groups with log-linear rates, Muon for the matrices that make motion, and rows that come
+and go with the anchors.
 
 Knows nothing of why an anchor is added or removed.
 """
@@ -16,8 +17,11 @@ from graings.config import RatesConfig, TrainConfig
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.training.guard import Gradient
+from graings.training.muon import Muon
 
 ADAM_EPSILON = 1e-15  # gradients of one Gaussian are tiny; the usual 1e-8 would damp them (3DGS)
+
+MOMENTUM_OF = "momentum"
 
 # Which group a parameter belongs to, by the head of its name in the scene.
 _GROUPS = {
@@ -33,6 +37,10 @@ _GROUPS = {
     "deformation": "deformation",
 }
 
+# Groups whose weight matrices Muon steps: what moves is found far sooner. Last layers, biases and codes stay Adam's.
+_ORTHOGONAL = ("deformation", "static")
+MATRICES = "matrices"  # the rate of all of them
+
 # Groups that first move in the joint phase: their schedule spans it.
 TEMPORAL_GROUPS = ("residual", "deformation")
 
@@ -44,8 +52,13 @@ def _group_of(name: str) -> str:
     raise ValueError(f"parameter {name} belongs to no optimiser group")
 
 
+def _steps_by_muon(name: str, parameter: nn.Parameter) -> bool:
+    matrix = parameter.ndim == 2 and name.endswith(".weight") and ".out." not in name
+    return matrix and _group_of(name) in _ORTHOGONAL
+
+
 class Optimizer:
-    """Adam for one scene.
+    """Adam, and Muon, for one scene.
 
     `step(iteration)` sets the rates for that iteration, steps the groups whose parameters have gradients and
     clears the gradients. `damping` is a factor on all rates.
@@ -58,15 +71,25 @@ class Optimizer:
         self.joint_from = joint_from
         self.damping = 1.0
         members: dict[str, list[nn.Parameter]] = {}
+        matrices: list[nn.Parameter] = []
+        self._muon_groups: list[str] = []
         for name, parameter in scene.named_parameters():
-            members.setdefault(_group_of(name), []).append(parameter)
+            if config.matrix_step == "muon" and _steps_by_muon(name, parameter):
+                matrices.append(parameter)
+                self._muon_groups.append(_group_of(name))
+            else:
+                members.setdefault(_group_of(name), []).append(parameter)
         groups = [{"params": parameters, "name": group, "lr": 0.0} for group, parameters in members.items()]
         self.adam = torch.optim.Adam(groups, eps=ADAM_EPSILON, fused=True)
+        self.muon = Muon(matrices)
 
-    def rate(self, group: str, iteration: int) -> float:
-        """Learning rate of `group` at `iteration` (from 1): log-linear from first to last."""
+    def rate(self, group: str, iteration: int, like: str | None = None) -> float:
+        """Learning rate of `group` at `iteration` (from 1): log-linear from first to last.
+
+        It runs over the iterations in which `like` (left out: the group itself) moves.
+        """
         first, last = getattr(self.rates, group)
-        start = self.joint_from if group in TEMPORAL_GROUPS else 0
+        start = self.joint_from if (like or group) in TEMPORAL_GROUPS else 0
         progress = min(1.0, max(0.0, (iteration - start) / max(1, self.iterations - start)))
         if first <= 0 or last <= 0:
             return float(first + (last - first) * progress)
@@ -77,6 +100,7 @@ class Optimizer:
         for group in self.adam.param_groups:
             group["lr"] = self.damping * self.rate(group["name"], iteration)
         self.adam.step()
+        self.muon.step([self.damping * self.rate(MATRICES, iteration, like=group) for group in self._muon_groups])
         self.clear()
 
     def gradients(self) -> list[Gradient]:
@@ -91,12 +115,14 @@ class Optimizer:
         """Limit the gradients of `group`: no entry above `times` its own usual size, and all together at most `norm`.
 
         The usual size is the root of Adam's second moment as it is stored, so that `times` = 100 lets the moment grow
-        11-fold and the following steps shrink to 30 %, however young the moment is. An entry without one is limited
-        with its group only. A single spike thus neither freezes its own parameter nor takes its group down with it.
+        11-fold and the following steps shrink to 30 %, however young the moment is. An entry without one, also of a
+        matrix that Muon steps, is limited with its group only. A single spike thus neither freezes its own parameter
+        nor takes its group down with it.
         """
-        members = next(members for members in self.adam.param_groups if members["name"] == group)
+        members = [p for one in self.adam.param_groups if one["name"] == group for p in one["params"]]
+        members += [p for p, owner in zip(self.muon.parameters, self._muon_groups, strict=True) if owner == group]
         gradients: list[Tensor] = []
-        for parameter in members["params"]:
+        for parameter in members:
             if parameter.grad is None:
                 continue
             state = self.adam.state.get(parameter)
@@ -112,7 +138,8 @@ class Optimizer:
 
     def clear(self) -> None:
         """Drop all gradients."""
-        self.adam.zero_grad(set_to_none=True)
+        for parameter in self.scene.parameters():
+            parameter.grad = None
 
     def append(self, rows: dict[str, Tensor]) -> None:
         """Add anchors: `rows` holds new rows for every name in `Scaffold.ROWS`; their moments start at zero."""
@@ -140,19 +167,27 @@ class Optimizer:
                 self.adam.state[new] = state
 
     def state(self) -> dict[str, Tensor]:
-        """Adam's moments and step counts by parameter name."""
+        """What the next step depends on beside the parameters, by their names: moments and counts, or momenta."""
+        momenta = dict(zip(self.muon.parameters, self.muon.momenta, strict=True))
         state: dict[str, Tensor] = {}
         for name, parameter in self.scene.named_parameters():
             for key, value in self.adam.state.get(parameter, {}).items():
                 state[f"{name}/{key}"] = value
+            if parameter in momenta:
+                state[f"{name}/{MOMENTUM_OF}"] = momenta[parameter]
         return state
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Continue from what `state()` gave for a scene of the same shape."""
         parameters = dict(self.scene.named_parameters())
+        places = {parameter: place for place, parameter in enumerate(self.muon.parameters)}
         for key, value in state.items():
             name, _, field = key.rpartition("/")
-            self.adam.state[parameters[name]][field] = value.clone()
+            parameter = parameters[name]
+            if parameter not in places:
+                self.adam.state[parameter][field] = value.clone()
+            elif field == MOMENTUM_OF:  # checkpoints of 0.1.0 hold Adam's moments here: their momentum begins anew
+                self.muon.momenta[places[parameter]] = value.clone()
 
 
 def _grow(moment: Tensor, new: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,12 +14,24 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import TrainConfig, make_config
 from graings.evaluation import evaluate
+from graings.raster.photometric import photometric
+from graings.render import draw
+from graings.scene.scene import Scene
 from graings.threads import use_threads
 from graings.training import trainer as trainer_module
+from graings.training.optimizer import Optimizer
 from graings.training.trainer import StepReport, Trainer
 
 # Nothing grows or goes unless a test wants it: parameters keep their identity.
 STILL = {"density.grow_from": 30_000, "density.grow_until": 0, "density.prune_from": 30_000, "density.prune_until": 0}
+
+# Where anchors are to be born: from the first tenth to the half of the run.
+GROWING = {
+    "density.statistics_from": 0,
+    "density.grow_from": 3_000,
+    "density.grow_until": 15_000,
+    "density.grow_every": 20,
+}
 
 
 def micro_config(**overrides: object) -> TrainConfig:
@@ -50,6 +63,26 @@ def micro_trainer(capture: Path, **overrides: object) -> Trainer:
 
 def steps(trainer: Trainer, count: int) -> list[StepReport]:
     return [trainer.step() for _ in range(count)]
+
+
+def plain_training(trainer: Trainer, dtype: torch.dtype, count: int) -> tuple[Scene, list[float]]:
+    """`count` steps of a copy of the trainer's scene in one precision: views in order, the photometric loss alone.
+
+    Returns the trained scene and the loss of every step.
+    """
+    scene = copy.deepcopy(trainer.scene).to(dtype)
+    scene.temporal = True
+    optimizer = Optimizer(scene, trainer.config, joint_from=0)
+    found = []
+    for iteration in range(1, count + 1):
+        frame = trainer.capture.train[iteration % len(trainer.capture.train)]
+        target = torch.from_numpy(trainer.images.rgb(frame)).to(dtype)
+        drawn = draw(scene.compose(frame.camera.center, frame.time), frame.camera, trainer.background)
+        loss = photometric(drawn.color, target, 0.2)
+        loss.backward()
+        optimizer.step(iteration)
+        found.append(float(loss.detach()))
+    return scene, found
 
 
 def said(reports: list[StepReport], word: str) -> list[str]:

@@ -39,6 +39,7 @@ def test_static_step_leaves_temporal_parameters_and_moments_untouched() -> None:
     optimizer.step(1)
     assert all(torch.equal(a, b) for a, b in zip(before, frozen, strict=True))
     assert all(parameter not in optimizer.adam.state for parameter in frozen)
+    assert all(torch.count_nonzero(momentum) == 0 for momentum in optimizer.muon.momenta)
 
 
 def test_phases_are_data() -> None:

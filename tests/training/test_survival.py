@@ -1,7 +1,7 @@
 """Training under fire: the E cases of the numerics matrix, each provoked in a real trainer on a tiny capture.
 
 E15 and E16 are tests of `tests.scene.test_scene` and `tests.training.test_run`, E17 and E21 of `test_run` and
-`test_diverged`. E08 (spread over seeds) needs scenes trained to the end, which no quick test has.
+`test_diverged`, E08 and the longer half of E07 of `test_spread`.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from torch import nn
 
 from graings.checkpoint import load_model
 from graings.errors import DivergedError
-from graings.raster.photometric import photometric
 from graings.raster.rasterize import rasterize
 from graings.render import draw, render
 from graings.training.budget import affordable_anchors, bytes_per_anchor
 from graings.training.density import MIN_ANCHORS
-from graings.training.optimizer import Optimizer
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 from tests.scenes import overlapping
 from tests.training.micro import (
+    GROWING,
     everywhere,
     finite,
     first,
     micro_config,
     micro_trainer,
+    plain_training,
     quality,
     said,
     spoil_gradient,
@@ -200,6 +200,26 @@ def test_a_finite_spike_is_limited_and_does_not_freeze_its_parameter(micro: Path
     assert min(ratios) >= 0.2
 
 
+def test_a_finite_spike_does_not_stop_the_rest_of_its_matrix(micro: Path) -> None:
+    """E03 where singular values are made equal: 1e10 in one entry; the updates of all other entries afterwards."""
+    trainer = micro_trainer(micro, iterations=300)
+    name = "deformation.hidden.0.weight"
+    spoil_gradient(trainer, name, lambda i: i == 100, lambda gradient: first(gradient, 1e10))
+    matrix = dict(trainer.scene.named_parameters())[name]
+    sizes = []
+    for iteration in range(1, 301):
+        before = matrix.detach().clone()
+        events = trainer.step().events
+        moved = (matrix.detach() - before)[1:, 1:].square().mean().sqrt()
+        sizes.append(float(moved) / trainer.optimizer.rate("matrices", iteration, like="deformation"))
+        if iteration == 100:
+            assert len(events) == 1
+            assert events[0].startswith("clipped: gradients of deformation at 1e+10")
+    normal = sum(sizes[60:99]) / 39
+    assert min(sizes[99:]) >= 0.2 * normal
+    assert finite(trainer)
+
+
 @pytest.mark.parametrize(("number", "drift"), [(0.0, 0.0), (1e-25, 1e-8)])
 def test_gradients_that_are_nothing_or_almost_move_nothing(micro: Path, number: float, drift: float) -> None:
     """E04: 100 steps."""
@@ -290,27 +310,10 @@ def test_pruning_everything_leaves_a_scene_to_train(micro: Path) -> None:
     assert quality(trainer) > before
 
 
-def _losses(trainer: Trainer, dtype: torch.dtype, count: int) -> list[float]:
-    """Losses of plain training in one precision, views in order."""
-    scene = copy.deepcopy(trainer.scene).to(dtype)
-    scene.temporal = True
-    optimizer = Optimizer(scene, trainer.config, joint_from=0)
-    found = []
-    for iteration in range(1, count + 1):
-        frame = trainer.capture.train[iteration % len(trainer.capture.train)]
-        target = torch.from_numpy(trainer.images.rgb(frame)).to(dtype)
-        drawn = draw(scene.compose(frame.camera.center, frame.time), frame.camera, trainer.background)
-        loss = photometric(drawn.color, target, 0.2)
-        loss.backward()
-        optimizer.step(iteration)
-        found.append(float(loss.detach()))
-    return found
-
-
 def test_single_and_double_precision_learn_alike(micro: Path) -> None:
-    """E07: 50 iterations without growth; losses and not parameters, whose paths are chaotic."""
+    """E07, 50 iterations without growth: losses and not parameters, whose paths are chaotic."""
     trainer = micro_trainer(micro)
-    single, double = (_losses(trainer, dtype, 50) for dtype in (torch.float32, torch.float64))
+    single, double = (plain_training(trainer, dtype, 50)[1] for dtype in (torch.float32, torch.float64))
     assert single[-1] < 0.7 * single[0]
     assert max(abs(a - b) / b for a, b in zip(single, double, strict=True)) < 1e-2
     assert abs(single[0] - double[0]) / double[0] < 1e-5
@@ -418,14 +421,6 @@ def test_a_quaternion_and_its_negative_draw_the_same_bits() -> None:
     white = torch.ones(3, dtype=torch.float64)
     pictures = [rasterize(replace(batch, quats=sign * batch.quats), camera, white).color for sign in (1, -1)]
     assert torch.equal(*pictures)
-
-
-GROWING = {
-    "density.statistics_from": 0,
-    "density.grow_from": 3_000,
-    "density.grow_until": 15_000,
-    "density.grow_every": 20,
-}
 
 
 def test_children_born_in_one_place_part(micro: Path) -> None:

@@ -1,0 +1,101 @@
+"""Muon against torch's own, and where singular values have no business to be."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from graings.config import TrainConfig
+from graings.training.muon import ITERATIONS, Muon, orthogonal
+from graings.training.optimizer import Optimizer
+from tests.models import tiny_scene
+
+# Three products in each iteration, each rounded to the 8 digits of bfloat16.
+BFLOAT16 = 3 * ITERATIONS * 2.0**-9
+
+SHAPES = ((64, 39), (64, 64), (13, 64), (5, 1))
+
+
+def _matrices(seed: int) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return [torch.randn(shape, generator=generator) for shape in SHAPES]
+
+
+def test_steps_are_those_of_torch_to_the_digits_of_its_bfloat16() -> None:
+    ours, theirs = ([nn.Parameter(matrix) for matrix in _matrices(0)] for _ in range(2))
+    muon = Muon(ours)
+    oracle = torch.optim.Muon(theirs, lr=1e-3, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+    for seed in range(1, 21):
+        for a, b, gradient in zip(ours, theirs, _matrices(seed), strict=True):
+            a.grad, b.grad = gradient, gradient.clone()
+        muon.step([1e-3] * len(SHAPES))
+        oracle.step()
+    for a, b, start in zip(ours, theirs, _matrices(0), strict=True):
+        ours_moved, theirs_moved = a.detach() - start, b.detach() - start
+        assert float((ours_moved - theirs_moved).norm()) < BFLOAT16 * float(theirs_moved.norm())
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e30])
+def test_singular_values_end_near_one_whatever_the_size(scale: float) -> None:
+    matrices = [scale * matrix for matrix in _matrices(0)]
+    for matrix, even in zip(matrices, orthogonal(matrices), strict=True):
+        left, values, right = torch.linalg.svd(matrix.double(), full_matrices=False)
+        along = (left.mT @ even.double() @ right.mT).diagonal()[values > 0.01 * values[0]]
+        assert float(along.min()) > 0.6
+        assert float(along.max()) < 1.25
+
+
+def test_a_rare_direction_moves_as_far_as_a_common_one() -> None:
+    left, right = (torch.linalg.qr(torch.randn(8, 8, generator=torch.Generator().manual_seed(i)))[0] for i in (0, 1))
+    uneven = left @ torch.diag(torch.logspace(0, -1.5, 8)) @ right
+    (even,) = orthogonal([uneven])
+    along = (left.mT @ even @ right.mT).diagonal()
+    assert float(along.min()) > 0.6
+    assert float(along.max()) < 1.25
+
+
+def test_nothing_stays_nothing() -> None:
+    parameter = nn.Parameter(torch.ones(4, 3))
+    muon = Muon([parameter])
+    muon.step([0.1])  # no gradient yet
+    parameter.grad = torch.zeros(4, 3)
+    muon.step([0.1])
+    assert torch.equal(parameter.detach(), torch.ones(4, 3))
+
+
+def test_vectors_are_refused() -> None:
+    with pytest.raises(ValueError, match="matrices"):
+        Muon([nn.Parameter(torch.ones(3))])
+
+
+def test_matrices_of_geometry_are_its_own_and_all_else_is_adams() -> None:
+    scene = tiny_scene()
+    optimizer = Optimizer(scene, TrainConfig(), joint_from=0)
+    owned = {id(parameter) for parameter in optimizer.muon.parameters}
+    found = {name.removesuffix(".weight") for name, parameter in scene.named_parameters() if id(parameter) in owned}
+    moving = {"from_position", "hidden.0", "psi.0", "psi.2"}
+    assert found == {f"deformation.{name}" for name in moving} | {"static.from_feature", "static.from_offset"}
+    others = {id(p) for group in optimizer.adam.param_groups for p in group["params"]}
+    assert owned.isdisjoint(others)
+    assert len(owned) + len(others) == len(list(scene.parameters()))
+
+
+def test_adam_takes_everything_where_it_is_asked_to() -> None:
+    assert Optimizer(tiny_scene(), TrainConfig(matrix_step="adam"), joint_from=0).muon.parameters == []
+
+
+def test_momenta_come_back_by_name_and_those_of_adam_are_left() -> None:
+    scene = tiny_scene()
+    optimizer = Optimizer(scene, TrainConfig(), joint_from=0)
+    for number, momentum in enumerate(optimizer.muon.momenta):
+        momentum.fill_(number + 1.0)
+    state = optimizer.state()
+    again = Optimizer(scene, TrainConfig(), joint_from=0)
+    again.load(state)
+    assert all(torch.equal(a, b) for a, b in zip(again.muon.momenta, optimizer.muon.momenta, strict=True))
+    older = {f"{name.rpartition('/')[0]}/exp_avg": value for name, value in state.items()}
+    other = Optimizer(scene, TrainConfig(), joint_from=0)
+    other.load(older)
+    assert all(torch.count_nonzero(momentum) == 0 for momentum in other.muon.momenta)
+    assert other.adam.state == {}
