@@ -6,7 +6,7 @@ No dependencies; the colours follow the reader's light or dark theme. Knows noth
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Final
@@ -148,6 +148,20 @@ class DecibelAxis:
             parts.append(text(left, self.at(level) + 4, error(10 ** (-level / 20)), anchor="end"))
             parts.append(text(right, self.at(level) + 4, f"{level} dB"))
         return parts
+
+
+def panel(
+    across: LogAxis, quality: DecibelAxis, label: str, welcome: Sequence[float], name: Callable[[float], str]
+) -> list[str]:
+    """Grid, ticks and label of one panel; `welcome` are numbers that its horizontal axis may show, called by `name`."""
+    left, right, bottom = across.start, across.start + across.length, quality.bottom
+    parts = [rule(left, quality.at(level), right, quality.at(level)) for level in quality.levels]
+    for value in across.ticks(welcome):
+        parts.append(rule(across.at(value), quality.top, across.at(value), bottom))
+        parts.append(text(across.at(value), bottom + 20, name(value), anchor="middle"))
+    parts.append(rule(left, bottom, right, bottom, "axis"))
+    parts.append(text((left + right) / 2, bottom + 44, label, "label", "middle"))
+    return parts
 
 
 def text(x: float, y: float, words: str, kind: str = "note", anchor: str = "start") -> str:

@@ -18,6 +18,7 @@ from graings.drawing import (
     duration,
     line,
     mark,
+    panel,
     rule,
     sheet,
     svg,
@@ -114,12 +115,7 @@ def _panels(shown: Sequence[tuple[int, Mapping[str, Any]]]) -> list[str]:
     for place, (key, label, welcome, name) in enumerate(panels):
         left = LEFT + place * (PANEL + GUTTER)
         axis = LogAxis.over([float(point[key]) for point in points], left, PANEL)
-        parts += [rule(left, quality.at(level), left + PANEL, quality.at(level)) for level in quality.levels]
-        for value in axis.ticks(welcome):
-            parts.append(rule(axis.at(value), TOP, axis.at(value), BOTTOM))
-            parts.append(text(axis.at(value), BOTTOM + 20, name(value), anchor="middle"))
-        parts.append(rule(left, BOTTOM, left + PANEL, BOTTOM, "axis"))
-        parts.append(text(left + PANEL / 2, BOTTOM + 44, label, "label", "middle"))
+        parts += panel(axis, quality, label, welcome, name)
         for index, part in shown:
             parts += _curve(part, index, [axis.at(p[key]) for p in part["points"]], quality)
     return parts

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
-from graings.drawing import COUNTS, SECONDS, DecibelAxis, LogAxis, count, duration, line, mark, rule, svg, text
+from graings.drawing import COUNTS, SECONDS, DecibelAxis, LogAxis, count, duration, line, mark, panel, svg, text
 from graings.errors import CheckpointError
 
 METRICS_SCHEMA: Final = "graings.metrics/1"
@@ -118,12 +118,7 @@ def _plot(points: Sequence[Mapping[str, Any]]) -> list[str]:
         left = LEFT + index * (PANEL + GUTTER)
         values = [float(point[key]) for point in points]
         axis = LogAxis.over(values, left, PANEL)
-        parts += [rule(left, quality.at(level), left + PANEL, quality.at(level)) for level in quality.levels]
-        for value in axis.ticks(welcome):
-            parts.append(rule(axis.at(value), TOP, axis.at(value), BOTTOM))
-            parts.append(text(axis.at(value), BOTTOM + 20, name(value), anchor="middle"))
-        parts.append(rule(left, BOTTOM, left + PANEL, BOTTOM, "axis"))
-        parts.append(text(left + PANEL / 2, BOTTOM + 44, label, "label", "middle"))
+        parts += panel(axis, quality, label, welcome, name)
         places = [(axis.at(value), quality.at(level)) for value, level in zip(values, decibels, strict=True)]
         parts.append(line(places))
         parts += [
