@@ -54,7 +54,7 @@ class SceneConfig(Part):
     feature_dim: int = Field(32, ge=1, le=256, description="Length of the anchor feature (d_f).")
     head_width: int = Field(32, ge=4, le=512, description="Hidden width of the colour, opacity and residual heads.")
     static_width: int = Field(64, ge=4, le=512, description="Hidden width of StaticMLP.")
-    deform_width: int = Field(64, ge=4, le=1024, description="Hidden width of DeformNet.")
+    deform_width: int = Field(128, ge=4, le=1024, description="Hidden width of DeformNet.")
     deform_depth: int = Field(3, ge=1, le=12, description="Hidden layers of DeformNet.")
     position_frequencies: int = Field(6, ge=0, le=16, description="Octaves of the position encoding in DeformNet.")
     deform_time: Literal["product", "input"] = Field(
@@ -110,7 +110,7 @@ class DensityConfig(Part):
     grow_from: int = Field(1_500, ge=0, description="First growth.")
     grow_until: int = Field(20_000, ge=0, description="Last growth.")
     grow_every: int = Field(100, ge=1, description="Iterations between growths (not scaled).")
-    gradient_threshold: float = Field(2e-4, gt=0, description="tau_g, mean screen gradient in NDC units.")
+    gradient_threshold: float = Field(3e-4, gt=0, description="tau_g, mean screen gradient in NDC units.")
     min_observations: int = Field(40, ge=0, description="tau_obs, times a child must have been drawn (not scaled).")
     levels: int = Field(3, ge=1, le=6, description="Cell sizes 4^(levels-1) v ... v.")
     newborn_opacity: float | None = Field(
@@ -139,15 +139,15 @@ class RatesConfig(Part):
     """
 
     offsets: tuple[float, float] = (0.02, 2e-4)
-    features: tuple[float, float] = (0.0075, 0.0075)
-    log_scales: tuple[float, float] = (0.007, 0.007)
+    features: tuple[float, float] = (0.0075, 0.0015)
+    log_scales: tuple[float, float] = (0.007, 0.0014)
     opacity_offsets: tuple[float, float] = (0.02, 0.002)
     static: tuple[float, float] = (0.004, 0.0004)
     color: tuple[float, float] = (0.008, 5e-5)
     opacity: tuple[float, float] = (0.002, 2e-5)
     residual: tuple[float, float] = (0.002, 2e-5)
-    deformation: tuple[float, float] = (2e-3, 2e-4)
-    matrices: tuple[float, float] = (8e-3, 2e-4)
+    deformation: tuple[float, float] = (2e-3, 5e-5)
+    matrices: tuple[float, float] = (2e-3, 5e-5)
 
 
 class GuardConfig(Part):
@@ -208,7 +208,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         # Many steps of few Gaussians: what moves is found sooner than with few steps of many.
         "iterations": 5_000,
         "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 1_200},
-        "rates": {"offsets": (0.03, 3e-4)},
+        "rates": {"offsets": (0.03, 3e-4), "matrices": (8e-3, 2e-4)},
     },
     "standard": {"iterations": 15_000},
     "paper": {"iterations": PAPER_ITERATIONS},

@@ -84,9 +84,9 @@ def test_growing_twice_from_the_same_statistics_adds_nothing_in_the_same_cells()
 
 
 def test_finer_levels_ask_for_larger_gradients() -> None:
-    scaffold = tiny_scene(anchors=200).scaffold
-    coarse = _grow(scaffold, _busy(scaffold, gradient=3e-4), levels=2).rows["log_scales"].unique()
-    both = _grow(scaffold, _busy(scaffold, gradient=5e-4), levels=2).rows["log_scales"].unique()
+    scaffold, least = tiny_scene(anchors=200).scaffold, DensityConfig().gradient_threshold
+    coarse = _grow(scaffold, _busy(scaffold, gradient=1.5 * least), levels=2).rows["log_scales"].unique()
+    both = _grow(scaffold, _busy(scaffold, gradient=2.5 * least), levels=2).rows["log_scales"].unique()
     assert torch.allclose(coarse, torch.tensor([math.log(4 * VOXEL)]))
     assert len(both) == 2
 

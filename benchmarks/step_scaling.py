@@ -1,0 +1,99 @@
+"""How a training step's time grows: against Gaussians at one image size, against pixels at one scene.
+
+    python benchmarks/step_scaling.py RUN -o FOLDER [--threads 2] [--steps 40]        (needs the extra `bench`)
+
+Continues RUN (a folder with a checkpoint) in memory; nothing in it is written. Fewer Gaussians are a random share of
+its anchors, other sizes the same capture read anew, so the largest useful size is that of its files. Writes
+FOLDER/step_scaling.{json,svg} and prints median milliseconds and the slope of log time against log size: 1 is linear, 0
+does not grow. The parts are those of training_step.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from pathlib import Path
+
+import torch
+from matplotlib import pyplot
+from raster_scaling import slope
+from training_step import Stopwatch, measured_step
+
+from graings import kernel
+from graings.capture.load import load_capture
+from graings.training.run import TrainingRun
+from graings.training.trainer import Trainer
+
+SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+SIDES = (100, 200, 400, 800)
+
+
+def milliseconds(trainer: Trainer, steps: int) -> tuple[int, dict[str, float]]:
+    """(Gaussians drawn, median milliseconds by part)."""
+    for _ in range(5):
+        trainer.step()
+    watch = Stopwatch()
+    drawn = [measured_step(trainer, watch) for _ in range(steps)]
+    return round(statistics.median(drawn)), {name: statistics.median(all_) for name, all_ in watch.parts.items()}
+
+
+def trainer_of(options: argparse.Namespace, share: float, side: int | None) -> Trainer:
+    """A trainer of the run with that share of its anchors, on images of that size (None: the run's own)."""
+    run = TrainingRun.resume(options.run, threads=options.threads)
+    trainer: Trainer = run._trainer
+    # Where nothing grows or goes any more.
+    trainer.iteration = min(trainer.iteration, run.iterations - options.steps - 10)
+    if side is not None:
+        trainer.capture = load_capture(run.capture.root, run.config.capture.model_copy(update={"max_side": side}))
+    if share < 1:
+        count = trainer.scene.scaffold.count
+        keep = torch.rand(count, generator=torch.Generator().manual_seed(0)) < share
+        trainer.optimizer.keep(keep)
+        trainer.statistics.resize(keep=keep)
+    return trainer
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--threads", type=int, default=None)
+    parser.add_argument("--steps", type=int, default=40)
+    options = parser.parse_args()
+
+    by_count = dict(milliseconds(trainer_of(options, share, None), options.steps) for share in SHARES)
+    by_pixels: dict[int, dict[str, float]] = {}
+    for side in SIDES:
+        trainer = trainer_of(options, 1.0, side)
+        camera = trainer.capture.train[0].camera
+        by_pixels[camera.width * camera.height] = milliseconds(trainer, options.steps)[1]
+    series = {"Gaussians drawn": by_count, "pixels of an image": by_pixels}
+    figure, axes = pyplot.subplots(1, 2, figsize=(11, 4.8), layout="constrained", sharey=True)
+    for axis, (title, rows) in zip(axes, series.items(), strict=True):
+        sizes = sorted(rows)
+        print(f"\n{title:<48} " + "  ".join(f"{size:8,d}" for size in sizes))
+        lines = {name: [(float(size), rows[size][name]) for size in sizes] for name in rows[sizes[0]]}
+        lines["all"] = [(float(size), sum(rows[size].values())) for size in sizes]
+        for name, points in lines.items():
+            print(f"  {name:<46} " + "  ".join(f"{y:8.2f}" for _, y in points) + f"   slope {slope(points):5.2f}")
+            style = {"color": "black", "linewidth": 2.2} if name == "all" else {}
+            label = f"{name.split(' (')[0]} ({slope(points):.2f})"
+            axis.loglog(*zip(*points, strict=True), marker="o", markersize=3, label=label, **style)
+        axis.set_xlabel(title)
+        axis.grid(True, which="major", color="0.9")
+        axis.legend(fontsize=7, frameon=False, title="part (slope)", title_fontsize=8)
+    axes[0].set_ylabel("milliseconds")
+    figure.suptitle(f"What one training step costs ({kernel.active_isa()}, {kernel.threads()} threads)")
+    options.output.mkdir(parents=True, exist_ok=True)
+    document = {
+        "isa": kernel.active_isa(),
+        "threads": kernel.threads(),
+        "series": {title: {str(size): row for size, row in rows.items()} for title, rows in series.items()},
+    }
+    (options.output / "step_scaling.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+    figure.savefig(options.output / "step_scaling.svg")
+
+
+if __name__ == "__main__":
+    main()
