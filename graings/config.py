@@ -206,7 +206,7 @@ class TrainConfig(Part):
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         # Many steps of few Gaussians: what moves is found sooner than with few steps of many.
-        "iterations": 5_000,
+        "iterations": 2_500,
         "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 1_200},
         "rates": {"offsets": (0.03, 3e-4), "matrices": (8e-3, 2e-4)},
     },
