@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import statistics
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import scenes
 import torch
 from matplotlib import pyplot
 from rasterize import Ours
+from scaling import show
 
 from graings import kernel
 from graings.threads import use_threads
@@ -42,13 +42,6 @@ def stages(ours: Ours, rounds: int) -> dict[str, float]:
     return {name: statistics.median(values) for name, values in seen.items()}
 
 
-def slope(points: list[tuple[float, float]]) -> float:
-    """Least squares through log-log points."""
-    xs, ys = [math.log(x) for x, _ in points], [math.log(max(y, 1e-6)) for _, y in points]
-    mx, my = statistics.fmean(xs), statistics.fmean(ys)
-    return sum((x - mx) * (y - my) for x, y in zip(xs, ys, strict=True)) / sum((x - mx) ** 2 for x in xs)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--yardstick", type=Path, required=True)
@@ -68,19 +61,7 @@ def main() -> None:
     }
     figure, axes = pyplot.subplots(1, len(series), figsize=(15, 4.5), layout="constrained", sharey=True)
     for axis, (title, rows) in zip(axes, series.items(), strict=True):
-        print(f"\nagainst {title}")
-        lines = {name: [(float(x), row[name]) for x, row in rows.items()] for name in next(iter(rows.values()))}
-        lines["all"] = [(float(x), sum(row.values())) for x, row in rows.items()]
-        for name, points in lines.items():
-            numbers = "  ".join(f"{y:8.2f}" for _, y in points)
-            print(f"  {name:<18} {numbers}   slope {slope(points):5.2f}")
-            style = {"color": "black", "linewidth": 2.2} if name == "all" else {}
-            axis.loglog(
-                *zip(*points, strict=True), marker="o", markersize=3, label=f"{name} ({slope(points):.2f})", **style
-            )
-        axis.set_xlabel(title)
-        axis.grid(True, which="major", color="0.9")
-        axis.legend(fontsize=8, frameon=False, title="stage (slope)", title_fontsize=8)
+        show(axis, title, rows, "stage")
     axes[0].set_ylabel("milliseconds")
     figure.suptitle(f"What one forward + backward of the rasterizer costs ({kernel.active_isa()}, {cores} threads)")
     options.output.mkdir(parents=True, exist_ok=True)

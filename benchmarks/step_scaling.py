@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 from matplotlib import pyplot
-from raster_scaling import slope
+from scaling import show
 from training_step import Stopwatch, measured_step
 
 from graings import kernel
@@ -71,18 +71,7 @@ def main() -> None:
     series = {"Gaussians drawn": by_count, "pixels of an image": by_pixels}
     figure, axes = pyplot.subplots(1, 2, figsize=(11, 4.8), layout="constrained", sharey=True)
     for axis, (title, rows) in zip(axes, series.items(), strict=True):
-        sizes = sorted(rows)
-        print(f"\n{title:<48} " + "  ".join(f"{size:8,d}" for size in sizes))
-        lines = {name: [(float(size), rows[size][name]) for size in sizes] for name in rows[sizes[0]]}
-        lines["all"] = [(float(size), sum(rows[size].values())) for size in sizes]
-        for name, points in lines.items():
-            print(f"  {name:<46} " + "  ".join(f"{y:8.2f}" for _, y in points) + f"   slope {slope(points):5.2f}")
-            style = {"color": "black", "linewidth": 2.2} if name == "all" else {}
-            label = f"{name.split(' (')[0]} ({slope(points):.2f})"
-            axis.loglog(*zip(*points, strict=True), marker="o", markersize=3, label=label, **style)
-        axis.set_xlabel(title)
-        axis.grid(True, which="major", color="0.9")
-        axis.legend(fontsize=7, frameon=False, title="part (slope)", title_fontsize=8)
+        show(axis, title, rows, "part")
     axes[0].set_ylabel("milliseconds")
     figure.suptitle(f"What one training step costs ({kernel.active_isa()}, {kernel.threads()} threads)")
     options.output.mkdir(parents=True, exist_ok=True)
