@@ -120,7 +120,10 @@ class TrainingRun:
             facts = json.loads((folder / "run.json").read_text())
         except (OSError, ValueError) as error:
             raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
-        config = restored(TrainConfig, facts.get("config"), folder / "run.json")
+        stored = facts.get("config")
+        if isinstance(stored, dict):  # a run that does not say how its matrices step began when all were Adam's
+            stored = {"matrix_step": "adam"} | stored
+        config = restored(TrainConfig, stored, folder / "run.json")
         clock = Clock()
         started = time.perf_counter()
         data = load_capture(capture or Path(facts["capture"]["path"]), config.capture)

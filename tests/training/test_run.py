@@ -143,6 +143,14 @@ def test_resuming_without_a_checkpoint_starts_over(capture: Path, tmp_path: Path
     assert TrainingRun.resume(tmp_path / "run", threads=1).iteration == 0
 
 
+def test_a_run_from_before_there_was_muon_goes_on_without(capture: Path, tmp_path: Path) -> None:
+    TrainingRun.create(capture, tmp_path / "run", _config())
+    facts = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert facts["config"].pop("matrix_step") == "muon"
+    (tmp_path / "run" / "run.json").write_text(json.dumps(facts))
+    assert TrainingRun.resume(tmp_path / "run").config.matrix_step == "adam"
+
+
 def test_a_run_cut_off_before_its_metrics_writes_them_when_resumed(capture: Path, tmp_path: Path) -> None:
     list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=20)))
     metrics = tmp_path / "run" / "metrics.json"
