@@ -51,7 +51,10 @@ class Muon:
 
 
 def orthogonal(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row column"]:
-    """`matrix` with singular values near 1 (within 0.7 ... 1.2 of those above 1 % of the largest); 0 stays 0."""
+    """`matrix` with singular values near 1: within 0.6 ... 1.25 those above 1 % of the largest.
+
+    A matrix whose norm is below `NOTHING` is scaled by it instead, so 0 stays 0. Source: Jordan et al. 2024.
+    """
     # In double precision, in which no square of a single overflows.
     norm = torch.linalg.vector_norm(matrix, dtype=torch.float64)
     flat = (matrix / norm.clamp_min(NOTHING)).to(matrix.dtype)
