@@ -50,7 +50,7 @@ def trainer_of(options: argparse.Namespace, share: float, side: int | None) -> T
         count = trainer.scene.scaffold.count
         keep = torch.rand(count, generator=torch.Generator().manual_seed(0)) < share
         trainer.optimizer.keep(keep)
-        trainer.statistics.resize(keep=keep)
+        trainer.density.statistics.resize(keep=keep)
     return trainer
 
 

@@ -60,7 +60,7 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     leaves = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacities, gaussians.colors, offset]
     grads = torch.autograd.grad(result.color, leaves, image.grad)
     watch.lap("raster backward")
-    regulariser = trainer._regularisers(composition, frame)
+    regulariser = trainer.regularisers(composition, frame.time)
     watch.lap("regularisers forward (a second time of DeformNet)")
     torch.autograd.backward(
         [*leaves[:-1], *([regulariser] if regulariser.requires_grad else [])],
@@ -72,7 +72,7 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     watch.lap("guard")
     size = (frame.camera.width, frame.camera.height)
     visible = result.radii.amax(-1) > 0
-    trainer.statistics.observe(composition.children, grads[-1], visible, composition.opacities, size)
+    trainer.density.statistics.observe(composition.children, grads[-1], visible, composition.opacities, size)
     watch.lap("growth statistics")
     trainer.optimizer.step(trainer.iteration)
     watch.lap("optimizer")

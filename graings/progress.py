@@ -12,7 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-from graings.training.run import EvaluationPoint, RunReport
+from graings.training.journal import EvaluationPoint
+from graings.training.run import RunReport
 
 
 class _TimeLeft(ProgressColumn):

@@ -86,7 +86,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "graings.training.run",
     ),
     # The terminal.
-    "graings.progress": ("graings.training.run",),
+    "graings.progress": ("graings.training.journal", "graings.training.run"),
     "graings.interrupt": (),
     "graings.terminal": (),
     "graings.cli_training": (

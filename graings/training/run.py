@@ -8,10 +8,9 @@ Knows nothing of terminals, jobs or HTTP.
 from __future__ import annotations
 
 import json
-import math
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,37 +28,15 @@ from graings.checkpoint import (
 from graings.compact import read_compact, write_compact
 from graings.config import TrainConfig, restored
 from graings.errors import CheckpointError, DivergedError
-from graings.evaluation import evaluate, frames_per_second, subset
-from graings.machine import machine_facts, version_facts
+from graings.evaluation import evaluate, subset
 from graings.metrics import Lpips, SplitMetrics
-from graings.model import scene_bytes
 from graings.plan import Plan, make_plan
-from graings.report import METRICS_SCHEMA, config_hash, curve_svg, read_metrics, write_metrics, write_text
-from graings.report_folder import report_training
+from graings.report import read_metrics
 from graings.run_folder import MODEL_FILE, sole_trainer
 from graings.threads import use_threads
+from graings.training.journal import EvaluationPoint, Journal
 from graings.training.pace import Clock, Rate, evaluation_marks
 from graings.training.trainer import StepReport, Trainer
-from graings.work_precision import run_names
-
-SCHEMA = "graings.run/1"
-
-# Frames per second are measured on this many views.
-FPS_VIEWS = 8
-
-
-@dataclass(frozen=True, slots=True)
-class EvaluationPoint:
-    """Held-out quality at one moment of training; `train_s` excludes evaluation and checkpoints."""
-
-    iteration: int
-    train_s: float
-    psnr: float
-    rmse: float
-    ssim_3dgs: float
-    views: int
-    gaussians: int
-    anchors: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,15 +59,11 @@ class TrainingRun:
         self.plan: Plan = make_plan(capture, config)
         self.applied = self.plan.apply(config)
         self.images = ImageStore(config.capture.background_rgb(), config.capture.cache_mb)
-        self._clock = clock
+        self._journal = Journal(folder, capture, config, self.plan, clock)
         started = time.perf_counter()
         self._trainer = Trainer(capture, self.images, self.applied)
         clock.add("init", time.perf_counter() - started)
-        self._curve: list[dict[str, Any]] = []
-        self._events: list[dict[str, Any]] = []
-        self._last_gaussians = 0
         self._best_psnr: float | None = None
-        self._diverged: str | None = None
 
     @classmethod
     def create(cls, capture: Path, folder: Path, config: TrainConfig) -> TrainingRun:
@@ -106,7 +79,7 @@ class TrainingRun:
         clock.add("load", time.perf_counter() - started)
         run = cls(folder, data, config, None, clock)
         folder.mkdir(parents=True, exist_ok=True)
-        run._write_run()
+        run._journal.write_run()
         return run
 
     @classmethod
@@ -134,11 +107,7 @@ class TrainingRun:
         if newest_checkpoint(folder) is not None:
             state = load_state(folder)
             run._trainer.load(load_model(folder).scene, state.tensors, state.facts["trainer"])
-            seconds = dict(state.facts["seconds"])
-            run._clock = Clock(seconds, state.facts.get("wall_s", sum(seconds.values())))
-            run._curve = list(state.facts["curve"])
-            run._events = list(state.facts["events"])
-            run._last_gaussians = int(state.facts["gaussians"])
+            run._journal.load(state.facts)
         best = best_checkpoint(folder)
         if best is not None:
             run._best_psnr = load_state(best).facts["curve"][-1]["psnr"]
@@ -174,10 +143,10 @@ class TrainingRun:
         due = evaluation_marks(self.config)
         rate = Rate()
         for step in self._trainer:
-            self._clock.add(step.phase, step.seconds)
-            self._last_gaussians = step.gaussians
+            self._journal.clock.add(step.phase, step.seconds)
+            self._journal.gaussians = step.gaussians
             rate.add(step.seconds)
-            self._note(step.events)
+            self._journal.note(self.iteration, step.events)
             last = step.iteration == self.iterations
             saving = step.iteration % self.config.evaluation.checkpoint_every == 0
             # Nobody looks at a scene, or saves it, that is not finite.
@@ -190,7 +159,7 @@ class TrainingRun:
             yield RunReport(
                 **({part.name: getattr(step, part.name) for part in fields(step)} | {"events": step.events + found}),
                 iterations_per_s=rate.per_second(),
-                train_s=self._clock.train_s(),
+                train_s=self._journal.clock.train_s(),
                 evaluation=point,
             )
 
@@ -206,12 +175,9 @@ class TrainingRun:
             raise
         return self._save()
 
-    def _note(self, events: Iterable[str]) -> None:
-        self._events += [{"iteration": self.iteration, "what": what} for what in events]
-
     def _check(self) -> tuple[str, ...]:
         found = tuple(self._trainer.check())
-        self._note(found)
+        self._journal.note(self.iteration, found)
         return found
 
     def _save(self, *, finished: bool = False, best: bool = False, instead_of_later: bool = False) -> Path:
@@ -222,14 +188,7 @@ class TrainingRun:
             scene=self._trainer.scene,
             state=TrainingState(
                 tensors,
-                {
-                    "trainer": facts,
-                    "seconds": self._clock.seconds,
-                    "wall_s": self._clock.wall_s(),
-                    "curve": self._curve,
-                    "events": self._events,
-                    "gaussians": self._last_gaussians,
-                },
+                {"trainer": facts, **self._journal.state()},
             ),
             units=self.capture.units,
             background=self.config.capture.background_rgb(),
@@ -240,7 +199,7 @@ class TrainingRun:
             best=best,
             instead_of_later=instead_of_later,
         )
-        self._clock.add("checkpoint", time.perf_counter() - started)
+        self._journal.clock.add("checkpoint", time.perf_counter() - started)
         return path
 
     def _held_out(self) -> tuple[Frame, ...]:
@@ -254,28 +213,11 @@ class TrainingRun:
         started = time.perf_counter()
         metrics = evaluate(self._trainer.scene, frames, self.images, self.config.capture.background_rgb())
         point = self._point(metrics)
-        self._clock.add("evaluation", time.perf_counter() - started)
+        self._journal.clock.add("evaluation", time.perf_counter() - started)
         if self._best_psnr is None or point.psnr > self._best_psnr:
             self._best_psnr = point.psnr
             self._save(best=True)
         self._write_metrics({})
-        return point
-
-    def _point(self, metrics: SplitMetrics) -> EvaluationPoint:
-        if metrics.psnr is None or metrics.ssim_3dgs is None:
-            raise ValueError("a point of the curve needs at least one view")
-        rmse = math.sqrt(sum(view.mse for view in metrics.views) / len(metrics.views))
-        point = EvaluationPoint(
-            iteration=self.iteration,
-            train_s=self._clock.train_s(),
-            psnr=metrics.psnr,
-            rmse=rmse,
-            ssim_3dgs=metrics.ssim_3dgs,
-            views=len(metrics.views),
-            gaussians=self._last_gaussians,
-            anchors=self._trainer.scene.scaffold.count,
-        )
-        self._curve.append({**asdict(point), "total_s": self._clock.total_s()})
         return point
 
     def _finish(self) -> EvaluationPoint | None:
@@ -285,7 +227,7 @@ class TrainingRun:
             started = time.perf_counter()
             background = self.config.capture.background_rgb()
             point = self._point(evaluate(self._trainer.scene, self._held_out(), self.images, background))
-            self._clock.add("evaluation", time.perf_counter() - started)
+            self._journal.clock.add("evaluation", time.perf_counter() - started)
         splits = self._splits()
         self._save(finished=True)
         self._write_metrics(splits, self._export())
@@ -299,7 +241,7 @@ class TrainingRun:
         if self.capture.val:
             scene, background = read_compact(self.folder / MODEL_FILE).scene, self.config.capture.background_rgb()
             psnr = evaluate(scene, self.capture.val, self.images, background).psnr
-        self._clock.add("evaluation", time.perf_counter() - started)
+        self._journal.clock.add("evaluation", time.perf_counter() - started)
         return {"file": MODEL_FILE, "bytes": size, "psnr": psnr}
 
     def _splits(self) -> dict[str, Any]:
@@ -309,7 +251,7 @@ class TrainingRun:
         started = time.perf_counter()
         background = self.config.capture.background_rgb()
         full = evaluate(self._trainer.scene, self.capture.val, self.images, background, lpips=Lpips.find())
-        self._clock.add("evaluation", time.perf_counter() - started)
+        self._journal.clock.add("evaluation", time.perf_counter() - started)
         return {"val": full.to_json()}
 
     def _deliver(self, reason: str) -> None:
@@ -318,8 +260,8 @@ class TrainingRun:
         The best is that of the last good moment or of the best evaluation, whichever held-out views like more. What
         was saved after it is dropped: nobody should find it in its place.
         """
-        self._note([f"diverged: {reason}"])
-        self._diverged = reason
+        self._journal.note(self.iteration, [f"diverged: {reason}"])
+        self._journal.diverged = reason
         guard = self._trainer.guard
         self._trainer.restore()
         best, frames = best_checkpoint(self.folder), self._held_out()
@@ -328,7 +270,7 @@ class TrainingRun:
             if now.psnr is None or self._best_psnr >= now.psnr:
                 state = load_state(best)
                 self._trainer.adopt(load_model(best).scene, state.tensors, state.facts["trainer"], guard)
-                self._last_gaussians = int(state.facts["gaussians"])
+                self._journal.gaussians = int(state.facts["gaussians"])
         splits = self._splits()
         self._save(instead_of_later=True)
         self._write_metrics(splits, self._export())
@@ -340,67 +282,9 @@ class TrainingRun:
         document = read_metrics(self.metrics_path)
         return bool(document["iterations"] == self.iterations and (document["splits"] or not self.capture.val))
 
-    def _write_run(self) -> None:
-        started = time.perf_counter()
-        document = {
-            "schema": SCHEMA,
-            "capture": {
-                "path": str(self.capture.root.resolve()),
-                "hash": self.capture.content_hash,
-                "kind": self.capture.kind,
-                "notes": list(self.capture.notes),
-            },
-            "config": self.config.model_dump(mode="json"),
-            "plan": self.plan.to_json(),
-            "versions": version_facts(),
-        }
-        write_metrics(self.folder / "run.json", document)
-        self._clock.add("report", time.perf_counter() - started)
-
     def _write_metrics(self, splits: dict[str, Any], compact: dict[str, Any] | None = None) -> None:
-        started = time.perf_counter()
-        scene, background = self._trainer.scene, self.config.capture.background_rgb()
-        fps = frames_per_second(scene, subset(self.capture.train, FPS_VIEWS), background)
-        machine, versions = machine_facts(self.threads), version_facts()
-        self._clock.add("report", time.perf_counter() - started)
-        started = time.perf_counter()
-        document = {
-            "schema": METRICS_SCHEMA,
-            "splits": splits,
-            "train_s": self._clock.train_s(),
-            "total_s": self._clock.total_s(),
-            "wall_s": self._clock.wall_s(),
-            "phases_s": dict(self._clock.seconds),
-            "iterations": self.iteration,
-            "gaussians": self._last_gaussians,
-            "anchors": scene.scaffold.count,
-            "bytes": {"fp32": scene_bytes(scene), "compact": None if compact is None else compact["bytes"]},
-            "compact": compact,
-            "render_fps": fps,
-            "curve": self._curve,
-            "events": self._events,
-            "plan": self.plan.to_json(),
-            "capture": {
-                "frames": {split: len(self.capture.split(split)) for split in SPLITS},
-                "times": len(self.capture.times),
-                "width": self.capture.train[0].camera.width,
-                "height": self.capture.train[0].camera.height,
-                "background": list(background),
-                "notes": list(self.capture.notes),
-            },
-            "skipped_steps": self._trainer.guard.skipped,
-            "clipped_steps": self._trainer.guard.clipped,
-            "rollbacks": self._trainer.guard.rollbacks,
-            "diverged": self._diverged is not None,
-            "diverged_reason": self._diverged,
-            "machine": machine,
-            "versions": versions,
-            "seed": self.config.seed,
-            "hashes": {"config": config_hash(self.config), "capture": self.capture.content_hash},
-        }
-        write_metrics(self.metrics_path, document)
-        write_text(self.folder / "curve.svg", curve_svg(self._curve))
-        name = run_names([self.folder])[0]
-        facts = {"config": self.config.model_dump(mode="json")}
-        report_training(name, document, facts, self.folder / "report")
-        self._clock.add("report", time.perf_counter() - started)
+        trainer = self._trainer
+        self._journal.write_metrics(self.iteration, trainer.scene, trainer.guard, self.threads, splits, compact)
+
+    def _point(self, metrics: SplitMetrics) -> EvaluationPoint:
+        return self._journal.point(self.iteration, metrics, self._trainer.scene.scaffold.count)

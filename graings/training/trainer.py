@@ -16,31 +16,24 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from graings.capture.capture import Capture, Frame
+from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.errors import DivergedError
 from graings.raster.photometric import photometric
 from graings.render import draw
 from graings.scene.scene import Composition, Scene
-from graings.training import density, losses
-from graings.training.budget import affordable_anchors
-from graings.training.collapse import SCORE, Collapse, mean_logits, mend
-from graings.training.density import DensityStatistics
+from graings.training.collapse import SCORE, Collapse, mend
+from graings.training.density_control import DensityControl
 from graings.training.guard import Gradient, Guard, first_not_finite
 from graings.training.initialize import make_scene
 from graings.training.optimizer import Optimizer
+from graings.training.regularisers import regularisers
 from graings.training.snapshots import Snapshots
 from graings.training.streams import Streams, ViewSampler
 
-# The temporal term looks at no fewer children than this (decision 10).
-MIN_TEMPORAL_SAMPLE = 2_000
-
 # Every time training goes back, it goes on with this share of the rates.
 RATE_CUT = 0.5
-
-# With more of the anchors' budget taken than this, growth first removes those that show nothing.
-ROOM = 0.9
 
 # What the guard calls the gradients of the projected centres, which growth looks at.
 SCREEN = "screen"
@@ -95,18 +88,14 @@ class Trainer:
         self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
         self.times = capture.times
         self.iteration = 0
-        self.scene, self.voxel_size = make_scene(capture, images, config, self.streams)
-        self.next_uid = self.scene.scaffold.count
-        budget = affordable_anchors(config.scene, config.density.memory_mb)
-        self._density = config.density.model_copy(update={"max_anchors": min(config.density.max_anchors, budget)})
+        self.scene, voxel_size = make_scene(capture, images, config, self.streams)
         self.snapshots = Snapshots()
-        self._attach()
+        self._attach(voxel_size)
 
-    def _attach(self) -> None:
+    def _attach(self, voxel_size: float) -> None:
         """Everything whose shape follows the scene, and what watches over it."""
-        scaffold = self.scene.scaffold
         self.optimizer = Optimizer(self.scene, self.config, joint_from=self.phases[-1].first - 1)
-        self.statistics = DensityStatistics(scaffold.count, scaffold.slots)
+        self.density = DensityControl(self.config, self.scene, voxel_size)
         self.guard = Guard(self.config.guard)
         self.collapse = Collapse()
 
@@ -135,7 +124,7 @@ class Trainer:
         offset = torch.zeros(len(composition.gaussians), 2, requires_grad=True)
         result = draw(composition, frame.camera, self.background, means2d_offset=offset)
         image_loss = photometric(result.color, target, self.config.loss.ssim)
-        loss = image_loss + self._regularisers(composition, frame)
+        loss = image_loss + self.regularisers(composition, frame.time)
         # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.
         if loss.requires_grad:
             loss.backward()
@@ -151,9 +140,9 @@ class Trainer:
                 if group != SCREEN:
                     self.optimizer.limit(group, self.config.guard.clip, limit)
             # A step out of all proportion says nothing about where anchors are wanted.
-            if self._counts_statistics() and offset.grad is not None and not verdict.limits:
+            if self.density.watches(self.iteration) and offset.grad is not None and not verdict.limits:
                 visible = result.radii.amax(-1) > 0
-                self.statistics.observe(
+                self.density.statistics.observe(
                     composition.children,
                     offset.grad,
                     visible,
@@ -179,67 +168,20 @@ class Trainer:
             events=tuple(events),
         )
 
-    def _regularisers(self, composition: Composition, frame: Frame) -> Tensor:
-        """The weighted temporal, deformation and residual terms of Eq. 14; zero in the static phase."""
-        config = self.config.loss
-        total = torch.zeros(())
-        moved = composition.deformation
-        if moved is not None and len(composition.children) > 0:
-            if config.l_def:
-                total = total + config.gain * config.deformation * losses.deformation(moved)
-            if config.l_temp and len(self.times) > 1:
-                total = total + config.gain * config.temporal * self._temporal(composition, frame)
-        if composition.residual is not None and config.l_res and len(composition.children) > 0:
-            total = total + config.gain * config.residual * losses.residual(composition.residual)
-        return total
-
-    def _temporal(self, composition: Composition, frame: Frame) -> Tensor:
-        """Eq. 16 between this frame's time and one neighbouring training time, on a sample of the children."""
-        assert composition.deformation is not None
-        generator = self.streams["time_pairs"]
-        here = int(abs(self.times - frame.time).argmin())
-        side = 1 if int(torch.randint(2, (1,), generator=generator)) else -1
-        there = here + side if 0 <= here + side < len(self.times) else here - side
-        count = len(composition.children)
-        size = min(count, max(MIN_TEMPORAL_SAMPLE, int(self.config.loss.temporal_share * count)))
-        sample = torch.randperm(count, generator=generator)[:size].sort().values
-        neighbour = self.scene.deform(
-            composition.children[sample], composition.canonical_means[sample], float(self.times[there])
-        )
-        assert neighbour is not None
-        span = float(self.times[-1] - self.times[0])
-        gap = abs(float(self.times[there] - self.times[here]))
-        return losses.temporal(
-            composition.deformation.position[sample], neighbour.position, gap, span / (len(self.times) - 1)
-        )
-
-    def _counts_statistics(self) -> bool:
-        config, scaled = self.config.density, self.config.scaled
-        growing = scaled(config.statistics_from) < self.iteration <= scaled(config.grow_until)
-        return growing or scaled(config.grow_until) < self.iteration <= scaled(config.prune_until)
+    def regularisers(self, composition: Composition, time: float) -> Tensor:
+        """The terms of Eq. 14 on the model itself, with this run's weights and stream of time pairs."""
+        return regularisers(self.scene, composition, time, self.times, self.config.loss, self.streams["time_pairs"])
 
     def _adapt(self) -> list[str]:
         """Grow and prune where the schedule says so; returns what happened, in words."""
-        config, scaled = self.config.density, self.config.scaled
         events: list[str] = []
-        if (
-            scaled(config.grow_from) <= self.iteration <= scaled(config.grow_until)
-            and self.iteration % config.grow_every == 0
-        ):
-            events += self._grow()
-        every = max(1, scaled(config.prune_every))
-        if scaled(config.prune_from) <= self.iteration <= scaled(config.prune_until) and self.iteration % every == 0:
-            events += self._prune()
+        if self.density.grows(self.iteration):
+            born, events = self.density.grow(self.scene, self.optimizer, self.streams["growth"])
+            if born > 0:
+                self.guard.trend.grown()
+        if self.density.prunes(self.iteration):
+            events += self.density.prune(self.scene, self.optimizer)
         return events
-
-    def _prune(self) -> list[str]:
-        keep = density.prune(self.scene.scaffold, self.statistics, self.config.density)
-        removed = int((~keep).sum())
-        if removed == 0:
-            return []
-        self.optimizer.keep(keep)
-        self.statistics.resize(keep=keep)
-        return [f"pruned {removed} anchors"]
 
     def _watch(self, drawn: int, loss: float) -> list[str]:
         """Look after the scene's health and go back where it is lost; returns what happened, in words."""
@@ -325,42 +267,18 @@ class Trainer:
         self._slow_down()
         self.sampler = self._sampler()
 
-    def _grow(self) -> list[str]:
-        scene, config = self.scene, self._density
-        # Anchors that show nothing would keep others from growing for good: what is not drawn does not come back.
-        events = self._prune() if scene.scaffold.count > ROOM * config.max_anchors else []
-        growth = density.grow(
-            scene.scaffold,
-            self.statistics,
-            mean_logits(scene),
-            config,
-            self.voxel_size,
-            self.next_uid,
-            self.streams["growth"],
-        )
-        self.statistics.forget_grown(config.min_observations)
-        if growth.capped:
-            events.append("growth_capped: the budget of anchors is used up or too many wanted to grow")
-        if len(growth) == 0:
-            return events
-        self.optimizer.append(growth.rows)
-        self.statistics.resize(append=len(growth))
-        self.next_uid += len(growth)
-        self.guard.trend.grown()
-        return [f"grew {len(growth)} anchors", *events]
-
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Everything beside the scene that the next step depends on: tensors and JSON."""
         tensors = {f"adam/{name}": value for name, value in self.optimizer.state().items()}
-        tensors |= {f"statistics/{name}": value for name, value in self.statistics.state().items()}
+        statistics, growth = self.density.state()
+        tensors |= {f"statistics/{name}": value for name, value in statistics.items()}
         tensors |= {f"streams/{name}": value for name, value in self.streams.state().items()}
         tensors["sampler/remaining"] = self.sampler.remaining
         norms, guard = self.guard.state()
         tensors |= {f"guard/{name}": value for name, value in norms.items()}
         facts = {
             "iteration": self.iteration,
-            "next_uid": self.next_uid,
-            "voxel_size": self.voxel_size,
+            **growth,
             "guard": guard,
             "collapse": self.collapse.state(),
         }
@@ -369,7 +287,7 @@ class Trainer:
     def load(self, scene: Scene, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """Continue from a scene and what `state()` gave with it."""
         self.scene = scene
-        self._attach()
+        self._attach(float(facts["voxel_size"]))
         parts: dict[str, dict[str, Tensor]] = {
             name: {} for name in ("adam", "statistics", "streams", "sampler", "guard")
         }
@@ -377,7 +295,7 @@ class Trainer:
             part, _, name = key.partition("/")
             parts[part][name] = value
         self.optimizer.load(parts["adam"])
-        self.statistics.load(parts["statistics"])
+        self.density.load(parts["statistics"], facts)
         self.streams.load(parts["streams"])
         if "guard" in facts:  # checkpoints of 0.1.0 have none: their guard begins with them
             self.guard.load(parts["guard"], facts["guard"])
@@ -386,5 +304,3 @@ class Trainer:
         self.sampler = self._sampler()
         self.sampler.remaining = parts["sampler"]["remaining"].clone()
         self.iteration = int(facts["iteration"])
-        self.next_uid = int(facts["next_uid"])
-        self.voxel_size = float(facts["voxel_size"])

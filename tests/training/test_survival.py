@@ -426,7 +426,7 @@ def test_a_quaternion_and_its_negative_draw_the_same_bits() -> None:
 def test_children_born_in_one_place_part(micro: Path) -> None:
     """E18: 100 iterations after the birth of anchors with zero offsets, of which some view has seen something."""
     trainer = micro_trainer(micro, **GROWING)
-    old = trainer.next_uid
+    old = trainer.density.next_uid
     assert said(steps(trainer, 100), "grew")
     steps(trainer, 100)
     moments = trainer.optimizer.adam.state[trainer.scene.scaffold.offsets]["exp_avg_sq"]
@@ -441,16 +441,16 @@ def test_growing_does_not_tear_the_picture(micro: Path, monkeypatch: pytest.Monk
     """E19: quality right before and right after each growth."""
     trainer = micro_trainer(micro, **GROWING, **{"density.newborn_opacity": 0.02})
     drops: list[float] = []
-    grow = trainer._grow
+    grow = trainer.density.grow
 
-    def measured() -> list[str]:
+    def measured(*scene: Any) -> tuple[int, list[str]]:
         before = quality(trainer)
-        events = grow()
+        born, events = grow(*scene)
         if events:
             drops.append(before - quality(trainer))
-        return events
+        return born, events
 
-    monkeypatch.setattr(trainer, "_grow", measured)
+    monkeypatch.setattr(trainer.density, "grow", measured)
     steps(trainer, 110)
     assert drops
     assert max(drops) <= 0.5

@@ -1,0 +1,109 @@
+"""How a model behaves in time: flicker where nothing moves, and error between the times it was trained on.
+
+    python benchmarks/temporal.py RUN... -o FOLDER [--frames 100] [--view 0]        (needs the extra `bench`)
+
+Flicker: one held-out camera stands still while time runs through [0, 1]. A pixel rests where the figure covers it at
+every time and the mean over five frames around each stays within 4 levels of 255; what the frames differ from that mean
+is flicker, as RMS and largest deviation in levels. There is no truth for one camera at all times, so this measures
+steadiness and not error.
+
+Between frames: PSNR of training views, of held-out views whose time a training view shares (to a hundredth of the
+training spacing), and of those in between, with the spacing.
+
+Prints a row for each run and writes FOLDER/temporal.json and, for each run, FOLDER/NAME.png: 24 frames of the clip.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib import image
+
+from graings.capture.capture import Frame
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.checkpoint import load_model
+from graings.evaluation import evaluate, subset
+from graings.model import Model
+from graings.render import render
+
+REST_LEVELS = 4.0
+WINDOW = 5
+SHOWN = (4, 6)
+
+
+def clip(model: Model, view: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """(colors [T, H, W, 3] in [0, 1], alphas [T, H, W]) of one held-out camera at `frames` times over [0, 1]."""
+    camera = model.views["val"][view].camera
+    pictures = [render(model.scene, camera, float(t), model.background) for t in np.linspace(0, 1, frames)]
+    colors = np.stack([picture.color.clamp(0, 1).numpy() for picture in pictures])
+    return colors, np.stack([picture.alpha.numpy().reshape(colors.shape[1:3]) for picture in pictures])
+
+
+def flicker(colors: np.ndarray, alphas: np.ndarray) -> dict[str, float | None]:
+    """Share of covered pixels at rest, and in levels of 255 the RMS and largest deviation there from the slow part."""
+    half = WINDOW // 2
+    sums = np.cumsum(np.concatenate([np.zeros_like(colors[:1]), colors], dtype=np.float64), axis=0)
+    slow = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
+    covered = (alphas >= 0.5).all(axis=0)
+    rests = covered & (255 * np.ptp(slow, axis=0).max(axis=-1) <= REST_LEVELS)
+    fast = 255 * (colors[half:-half] - slow)[:, rests]
+    return {
+        "resting_share": float(rests.sum() / max(1, covered.sum())),
+        "rms_levels": float(np.sqrt((fast**2).mean())) if rests.any() else None,
+        "max_levels": float(np.abs(fast).max()) if rests.any() else None,
+    }
+
+
+def error_in_time(run: Path, model: Model) -> dict[str, float | None]:
+    """Mean PSNR in dB of training views, held-out views at training times and held-out views between them."""
+    root = json.loads((run / "run.json").read_text())["capture"]["path"]
+    capture = load_capture(Path(root), model.config.capture)
+    images = ImageStore(model.background, model.config.capture.cache_mb)
+    times = np.unique([frame.time for frame in capture.train])
+    spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+
+    def psnr(frames: list[Frame]) -> float | None:
+        return evaluate(model.scene, frames, images, model.background).psnr if frames else None
+
+    def apart(frame: Frame) -> float:
+        return float(np.abs(times - frame.time).min()) / spacing
+
+    return {
+        "spacing": spacing,
+        "train": psnr(list(subset(capture.train, 40))),
+        "at_training_times": psnr([frame for frame in capture.val if apart(frame) <= 0.01]),
+        "between": psnr([frame for frame in capture.val if apart(frame) > 0.01]),
+        "median_distance": statistics.median(apart(frame) for frame in capture.val),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--view", type=int, default=0)
+    options = parser.parse_args()
+
+    options.output.mkdir(parents=True, exist_ok=True)
+    torch.set_grad_enabled(False)
+    document = {}
+    for run in options.runs:
+        model = load_model(run)
+        colors, alphas = clip(model, options.view, options.frames)
+        document[run.name] = {**flicker(colors, alphas), **error_in_time(run, model)}
+        chosen = colors[np.linspace(0, len(colors) - 1, SHOWN[0] * SHOWN[1]).round().astype(int)]
+        rows = [np.concatenate(list(row), axis=1) for row in chosen.reshape(*SHOWN, *chosen.shape[1:])]
+        image.imsave(options.output / f"{run.name}.png", np.concatenate(rows)[::2, ::2])
+        print(run.name, json.dumps(document[run.name]), flush=True)
+    (options.output / "temporal.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()

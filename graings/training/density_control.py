@@ -1,0 +1,96 @@
+"""DensityControl: when anchors are watched, grown and pruned over a run, and what that needs to remember.
+
+`density` decides which; this asks it when the schedule says so and has scene, optimizer and statistics follow. Knows
+nothing of images, losses or guards.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from graings.config import TrainConfig
+from graings.scene.scene import Scene
+from graings.training import density
+from graings.training.budget import affordable_anchors
+from graings.training.collapse import mean_logits
+from graings.training.density import DensityStatistics
+from graings.training.optimizer import Optimizer
+
+# With more of the anchors' budget taken than this, growth first removes those that show nothing.
+ROOM = 0.9
+
+
+class DensityControl:
+    """Grows and prunes one scene. `voxel_size` is that of the finest cells, normalised."""
+
+    def __init__(self, config: TrainConfig, scene: Scene, voxel_size: float) -> None:
+        budget = min(config.density.max_anchors, affordable_anchors(config.scene, config.density.memory_mb))
+        self.config = config.density.model_copy(update={"max_anchors": budget})
+        self.scaled = config.scaled
+        self.voxel_size = voxel_size
+        self.next_uid = scene.scaffold.count
+        self.statistics = DensityStatistics(scene.scaffold.count, scene.scaffold.slots)
+
+    def watches(self, iteration: int) -> bool:
+        """Whether what `iteration` draws counts for the next growth or pruning."""
+        last_growth = self.scaled(self.config.grow_until)
+        growing = self.scaled(self.config.statistics_from) < iteration <= last_growth
+        return growing or last_growth < iteration <= self.scaled(self.config.prune_until)
+
+    def grows(self, iteration: int) -> bool:
+        """Whether anchors may be added after `iteration`."""
+        first, last = self.scaled(self.config.grow_from), self.scaled(self.config.grow_until)
+        return first <= iteration <= last and iteration % self.config.grow_every == 0
+
+    def prunes(self, iteration: int) -> bool:
+        """Whether anchors that show nothing go after `iteration`."""
+        first, last = self.scaled(self.config.prune_from), self.scaled(self.config.prune_until)
+        return first <= iteration <= last and iteration % max(1, self.scaled(self.config.prune_every)) == 0
+
+    def grow(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> tuple[int, list[str]]:
+        """Add anchors where the pictures ask for them; returns how many, and what happened in words."""
+        events: list[str] = []
+        # Anchors that show nothing would keep others from growing for good: what is not drawn does not come back.
+        if scene.scaffold.count > ROOM * self.config.max_anchors:
+            events = self.prune(scene, optimizer)
+        growth = density.grow(
+            scene.scaffold,
+            self.statistics,
+            mean_logits(scene),
+            self.config,
+            self.voxel_size,
+            self.next_uid,
+            generator,
+        )
+        self.statistics.forget_grown(self.config.min_observations)
+        if growth.capped:
+            events.append("growth_capped: the budget of anchors is used up or too many wanted to grow")
+        if len(growth) > 0:
+            optimizer.append(growth.rows)
+            self.statistics.resize(append=len(growth))
+            self.next_uid += len(growth)
+            events.insert(0, f"grew {len(growth)} anchors")
+        return len(growth), events
+
+    def prune(self, scene: Scene, optimizer: Optimizer) -> list[str]:
+        """Remove anchors that show nothing; returns what happened, in words."""
+        keep = density.prune(scene.scaffold, self.statistics, self.config)
+        removed = int((~keep).sum())
+        if removed == 0:
+            return []
+        optimizer.keep(keep)
+        self.statistics.resize(keep=keep)
+        return [f"pruned {removed} anchors"]
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Statistics, and facts as JSON."""
+        return self.statistics.state(), {"next_uid": self.next_uid, "voxel_size": self.voxel_size}
+
+    def load(self, statistics: dict[str, Tensor], facts: dict[str, Any]) -> None:
+        """Continue from what `state()` gave."""
+        self.statistics.load(statistics)
+        self.next_uid = int(facts["next_uid"])
+        self.voxel_size = float(facts["voxel_size"])

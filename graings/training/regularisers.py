@@ -1,0 +1,68 @@
+"""Regularisers: the terms of Eq. 14 on the model itself, weighted, for one composed frame.
+
+Chooses the pair of times and the sample of children that the temporal term compares. Knows nothing of images,
+schedules or optimisers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from graings.config import LossConfig
+from graings.scene.scene import Composition, Scene
+from graings.training import losses
+
+# The temporal term looks at no fewer children than this (decision 10).
+MIN_TEMPORAL_SAMPLE = 2_000
+
+
+def regularisers(
+    scene: Scene,
+    composition: Composition,
+    time: float,
+    times: NDArray[np.float64],
+    config: LossConfig,
+    generator: torch.Generator,
+) -> Float[Tensor, ""]:
+    """lambda_1 L_temp + lambda_2 L_def + lambda_3 L_res of `composition` at `time`; zero in the static phase.
+
+    `times` are the capture's training times, ascending; `generator` draws the neighbouring time and the sample.
+    """
+    total = torch.zeros(())
+    moved = composition.deformation
+    if moved is not None and len(composition.children) > 0:
+        if config.l_def:
+            total = total + config.gain * config.deformation * losses.deformation(moved)
+        if config.l_temp and len(times) > 1:
+            share = config.temporal_share
+            total = total + config.gain * config.temporal * _temporal(scene, composition, time, times, share, generator)
+    if composition.residual is not None and config.l_res and len(composition.children) > 0:
+        total = total + config.gain * config.residual * losses.residual(composition.residual)
+    return total
+
+
+def _temporal(
+    scene: Scene,
+    composition: Composition,
+    time: float,
+    times: NDArray[np.float64],
+    share: float,
+    generator: torch.Generator,
+) -> Tensor:
+    """Eq. 16 between this frame's time and one neighbouring training time, on a sample of the children."""
+    assert composition.deformation is not None
+    here = int(abs(times - time).argmin())
+    side = 1 if int(torch.randint(2, (1,), generator=generator)) else -1
+    there = here + side if 0 <= here + side < len(times) else here - side
+    count = len(composition.children)
+    size = min(count, max(MIN_TEMPORAL_SAMPLE, int(share * count)))
+    sample = torch.randperm(count, generator=generator)[:size].sort().values
+    neighbour = scene.deform(composition.children[sample], composition.canonical_means[sample], float(times[there]))
+    assert neighbour is not None
+    gap = abs(float(times[there] - times[here]))
+    mean_gap = float(times[-1] - times[0]) / (len(times) - 1)
+    return losses.temporal(composition.deformation.position[sample], neighbour.position, gap, mean_gap)
