@@ -62,7 +62,7 @@ def png(drawing: str) -> bytes:
 def _artist(element: ElementTree.Element, tag: str, style: Mapping[str, str]) -> Any:
     """What matplotlib draws for one element."""
     from matplotlib.lines import Line2D
-    from matplotlib.patches import Circle, Rectangle
+    from matplotlib.patches import Circle, Polygon, Rectangle
     from matplotlib.text import Text
 
     place = {key: float(value) for key, value in element.attrib.items() if key in _PLACES}
@@ -75,8 +75,10 @@ def _artist(element: ElementTree.Element, tag: str, style: Mapping[str, str]) ->
         across, down = [float(x) for x, _ in corners], [float(y) for _, y in corners]
         return Line2D(across, down, color=style["stroke"], solid_joinstyle="round", **stroke)
     if tag == "circle":
-        inks = {"facecolor": style["fill"], "edgecolor": style["stroke"]}
-        return Circle((place["cx"], place["cy"]), place["r"], linewidth=stroke["linewidth"], **inks)
+        return Circle((place["cx"], place["cy"]), place["r"], linewidth=stroke["linewidth"], **_inks(style))
+    if tag == "polygon":
+        outline = [tuple(map(float, pair.split(","))) for pair in element.attrib["points"].split()]
+        return Polygon(outline, linewidth=stroke["linewidth"], **_inks(style))
     if tag == "rect":
         corner = (place.get("x", 0.0), place.get("y", 0.0))
         return Rectangle(corner, place["width"], place["height"], facecolor=style["fill"], linewidth=0)
@@ -92,6 +94,12 @@ def _artist(element: ElementTree.Element, tag: str, style: Mapping[str, str]) ->
             verticalalignment="baseline",
         )
     raise ValueError(f"no drawing of ours contains <{tag}>")
+
+
+def _inks(style: Mapping[str, str]) -> dict[str, Any]:
+    """Inside and outline of an area."""
+    fill = (style["fill"], float(style.get("fill-opacity", 1)))
+    return {"facecolor": fill, "edgecolor": style.get("stroke", "none")}
 
 
 def _light_rules(sheet: str) -> list[tuple[str, dict[str, str]]]:

@@ -82,8 +82,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.ablation.table": ("graings.ablation.rows",),
     "graings.ablation.plot": ("graings.ablation.rows", "graings.ablation.table", "graings.drawing"),
     "graings.ablation.experiment": (
-        *("graings.ablation", "graings.capture", "graings.config", "graings.errors", "graings.report"),
-        "graings.training.run",
+        *("graings.ablation", "graings.capture", "graings.config", "graings.errors", "graings.picture"),
+        *("graings.report", "graings.training.run"),
     ),
     # The terminal.
     "graings.progress": ("graings.training.journal", "graings.training.run"),

@@ -20,7 +20,8 @@ from graings.capture.capture import Capture
 from graings.capture.load import load_capture
 from graings.config import TrainConfig, make_config
 from graings.errors import CaptureError, CheckpointError, ConfigError
-from graings.report import read_metrics, write_metrics, write_text
+from graings.picture import missing_reason, png
+from graings.report import read_metrics, write_bytes, write_metrics, write_text
 from graings.training.run import TrainingRun
 
 TABLE: Final = "ablation.json"
@@ -103,13 +104,16 @@ class Ablation:
             self.write()
 
     def write(self) -> dict[str, Any]:
-        """Write ablation.json, ablation.md and ablation.svg from the runs that are finished; returns the first."""
+        """Write ablation.json, .md, .svg and, with matplotlib, .png from all finished runs; returns the first."""
         self.folder.mkdir(parents=True, exist_ok=True)
         rows = [(row, {seed: self._of(row, seed) for seed in self._shown_seeds}) for row in self._shown_rows]
         table = document(self._facts(), rows)
         write_metrics(self.folder / TABLE, table)
         write_text(self.folder / "ablation.md", markdown(table))
-        write_text(self.folder / "ablation.svg", differences_svg(table))
+        drawing = differences_svg(table)
+        write_text(self.folder / "ablation.svg", drawing)
+        if missing_reason() is None:
+            write_bytes(self.folder / "ablation.png", png(drawing))
         return table
 
     def _facts(self) -> dict[str, Any]:

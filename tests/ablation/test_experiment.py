@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from graings.ablation.experiment import Ablation
@@ -97,6 +98,13 @@ def test_the_page_and_the_drawing_name_every_row_with_the_papers_difference(fold
     assert "\N{MINUS SIGN}1.34" in lines["without stop-gradient"]
     assert "2 of 2" in lines["without L_def"]
     assert sum(element.tag.endswith("}circle") for element in drawing.iter()) == 1 + 8 + 1  # legend, seed 0, seed 3
+
+
+def test_the_drawing_is_a_picture_too(folder: Path) -> None:
+    image = pytest.importorskip("matplotlib.image", reason="PNG needs the extra plot").imread(folder / "ablation.png")
+    seed = np.array([0x0D, 0x6B, 0x83]) / 255  # over paper at 0.55, see graings.ablation.plot
+    paper = image[0, 0, :3]
+    assert (np.abs(image[..., :3] - (0.55 * seed + 0.45 * paper)).max(-1) < 0.02).sum() > 500
 
 
 def test_a_second_call_runs_nothing_and_changes_nothing(folder: Path, capture: Path) -> None:
