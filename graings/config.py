@@ -182,6 +182,12 @@ class TrainConfig(Part):
     preset: Literal["draft", "standard", "paper"] = Field("standard", description="Where the defaults come from.")
     iterations: int = Field(15_000, ge=1, le=1_000_000, description="Optimisation steps.")
     warmup: int = Field(1_000, ge=0, description="Static warm-up T_w, of the 30 000 schedule; the paper has 3 000.")
+    average_from: int = Field(
+        29_000,
+        ge=0,
+        description="After this mark of the 30 000 schedule, and the last growth and pruning, parameters are averaged; "
+        "training ends with their mean. 30000: never.",
+    )
     matrix_step: Literal["muon", "adam"] = Field(
         "muon",
         description="How weight matrices of StaticMLP and DeformNet step. muon: orthogonalised momentum; adam: as the "

@@ -15,8 +15,8 @@ from graings.scene.encoding import encoding_width
 FLOAT: Final = 4
 MEGABYTE: Final = 1_000_000
 
-# A parameter comes with its gradient and two moments; two snapshots keep it with its moments twice more.
-COPIES: Final = 4 + 2 * 3
+# A parameter comes with its gradient, two moments and its mean; two snapshots keep all but the gradient twice more.
+COPIES: Final = 5 + 2 * 4
 
 # Means, quaternions, scales, opacity, colour, deformation and residual of one child, and what the rasterizer keeps.
 CHILD_FLOATS: Final = 64

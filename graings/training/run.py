@@ -26,7 +26,7 @@ from graings.checkpoint import (
     save_checkpoint,
 )
 from graings.compact import read_compact, write_compact
-from graings.config import TrainConfig, restored
+from graings.config import PAPER_ITERATIONS, TrainConfig, restored
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation import evaluate, subset
 from graings.metrics import Lpips, SplitMetrics
@@ -94,8 +94,8 @@ class TrainingRun:
         except (OSError, ValueError) as error:
             raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
         stored = facts.get("config")
-        if isinstance(stored, dict):  # a run that does not say how its matrices step began when all were Adam's
-            stored = {"matrix_step": "adam"} | stored
+        if isinstance(stored, dict):  # what a run does not say is as it was when there was no choice
+            stored = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS} | stored
         config = restored(TrainConfig, stored, folder / "run.json")
         clock = Clock()
         started = time.perf_counter()

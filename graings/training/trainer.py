@@ -23,6 +23,7 @@ from graings.errors import DivergedError
 from graings.raster.photometric import photometric
 from graings.render import draw
 from graings.scene.scene import Composition, Scene
+from graings.training.average import Average
 from graings.training.collapse import SCORE, Collapse, mend
 from graings.training.density_control import DensityControl
 from graings.training.guard import Gradient, Guard, first_not_finite
@@ -98,6 +99,7 @@ class Trainer:
         self.density = DensityControl(self.config, self.scene, voxel_size)
         self.guard = Guard(self.config.guard)
         self.collapse = Collapse()
+        self.average = Average()
 
     def __iter__(self) -> Iterator[StepReport]:
         while self.iteration < self.config.iterations:
@@ -155,6 +157,7 @@ class Trainer:
             events.append(f"skipped: {verdict.culprit} was not finite on {frame.name} at t = {frame.time:.4g}")
         events += self._adapt()
         events += self._watch(len(composition.children), float(loss.detach()))
+        self._settle()
         mse = float(functional.mse_loss(result.color.detach(), target))
         return StepReport(
             iteration=self.iteration,
@@ -205,6 +208,15 @@ class Trainer:
         elif due and self.guard.trend.healthy:
             self._take_snapshot()
         return events
+
+    def _settle(self) -> None:
+        """Average the last steps, after which no anchor comes or goes, and end with their mean."""
+        config = self.config.density
+        last_change = max(self.config.average_from, config.grow_until, config.prune_until)
+        if self.iteration > self.config.scaled(last_change):
+            self.average.add(self.scene)
+            if self.iteration == self.config.iterations:
+                self.average.apply(self.scene)
 
     def check(self) -> list[str]:
         """Make sure that the scene is finite before somebody looks at it or saves it, going back where it is not.
@@ -274,6 +286,8 @@ class Trainer:
         tensors |= {f"statistics/{name}": value for name, value in statistics.items()}
         tensors |= {f"streams/{name}": value for name, value in self.streams.state().items()}
         tensors["sampler/remaining"] = self.sampler.remaining
+        means, average = self.average.state()
+        tensors |= {f"average/{name}": value for name, value in means.items()}
         norms, guard = self.guard.state()
         tensors |= {f"guard/{name}": value for name, value in norms.items()}
         facts = {
@@ -281,6 +295,7 @@ class Trainer:
             **growth,
             "guard": guard,
             "collapse": self.collapse.state(),
+            "average": average,
         }
         return tensors, facts
 
@@ -289,7 +304,7 @@ class Trainer:
         self.scene = scene
         self._attach(float(facts["voxel_size"]))
         parts: dict[str, dict[str, Tensor]] = {
-            name: {} for name in ("adam", "statistics", "streams", "sampler", "guard")
+            name: {} for name in ("adam", "statistics", "streams", "sampler", "guard", "average")
         }
         for key, value in tensors.items():
             part, _, name = key.partition("/")
@@ -300,6 +315,8 @@ class Trainer:
         if "guard" in facts:  # checkpoints of 0.1.0 have none: their guard begins with them
             self.guard.load(parts["guard"], facts["guard"])
             self.collapse.load(facts["collapse"])
+        if "average" in facts:  # older ones did not average either
+            self.average.load(parts["average"], facts["average"])
         self._slow_down()
         self.sampler = self._sampler()
         self.sampler.remaining = parts["sampler"]["remaining"].clone()

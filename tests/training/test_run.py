@@ -143,12 +143,13 @@ def test_resuming_without_a_checkpoint_starts_over(capture: Path, tmp_path: Path
     assert TrainingRun.resume(tmp_path / "run", threads=1).iteration == 0
 
 
-def test_a_run_from_before_there_was_muon_goes_on_without(capture: Path, tmp_path: Path) -> None:
+def test_a_run_that_does_not_say_goes_on_as_it_began(capture: Path, tmp_path: Path) -> None:
     TrainingRun.create(capture, tmp_path / "run", _config())
     facts = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert facts["config"].pop("matrix_step") == "muon"
+    assert (facts["config"].pop("matrix_step"), facts["config"].pop("average_from")) == ("muon", 29_000)
     (tmp_path / "run" / "run.json").write_text(json.dumps(facts))
-    assert TrainingRun.resume(tmp_path / "run").config.matrix_step == "adam"
+    config = TrainingRun.resume(tmp_path / "run").config
+    assert (config.matrix_step, config.average_from) == ("adam", 30_000)
 
 
 def test_a_run_cut_off_before_its_metrics_writes_them_when_resumed(capture: Path, tmp_path: Path) -> None:
