@@ -7,8 +7,9 @@ temporary folder, the kernel is built again there where C++ changed, and the fas
 mutant that no test notices has survived, and the exit code is 1. The text to change must occur exactly once: after a
 formula has been rewritten, so must its mutant be, and the script says which.
 
-All but one break the rasterizer and are tried by tests/raster. Mutant (i) rounds times before they are normalised; the
-rasterizer knows no times, so it is tried by the tests of normalisation. Mutant (e) cuts a footprint at three standard
+Most break the rasterizer and are tried by tests/raster. Mutant (i) rounds times before they are normalised; the
+rasterizer knows no times, so it is tried by the tests of normalisation. The last five break the rest of the kernel:
+networks, positions, children, which tests/scene tries, and the loss. Mutant (e) cuts a footprint at three standard
 deviations, which in this kernel is a limit of the exponent and not a square; mutant (g) takes the position in the
 camera in float32 where pixels are float32; mutant (h) forgets the uids, so that rows decide; mutant (l) leaves flags as
 the memory was, which shows only where that was used before.
@@ -68,6 +69,7 @@ class Mutant:
 
 GEOMETRY, FRAME = f"{SOURCE}/geometry.hpp", f"{SOURCE}/frame.cpp"
 TILES, TILE_GRADIENT = f"{SOURCE}/tiles.hpp", f"{SOURCE}/tile_gradient.hpp"
+SCENE = ("tests/scene",)
 
 MUTANTS = (
     Mutant(
@@ -247,6 +249,39 @@ MUTANTS = (
         "ground = fma(g, p16(args.background[c]), ground);",
         "ground = fma(g, p16(R(0)), ground);",
     ),
+    Mutant(
+        "group-split",
+        "gradient of a group lost where pieces of work meet",
+        f"{SOURCE}/perceptron.cpp",
+        "to[c] += own[args.first_group_at + c];",
+        "to[c] += R(0);",
+        SCENE,
+    ),
+    Mutant(
+        "relu-passed",
+        "gradient passed through a closed ReLU",
+        f"{SOURCE}/layers.hpp",
+        "select(load<width>(levels[l] + i) <= zero, zero, load<width>(below + i))",
+        "max(load<width>(below + i), load<width>(below + i))",
+        SCENE,
+    ),
+    Mutant(
+        "octave",
+        "cosine doubled with the sine already doubled",
+        f"{SOURCE}/encoding.cpp",
+        "cosine = (cosine - sine) * (cosine + sine), sine = twice;",
+        "sine = twice, cosine = (cosine - sine) * (cosine + sine);",
+        SCENE,
+    ),
+    Mutant(
+        "adjoint",
+        "gradient turned forwards, not back",
+        f"{SOURCE}/children.cpp",
+        "v = product(v, conjugate(turn(moved)));",
+        "v = product(v, turn(moved));",
+        SCENE,
+    ),
+    Mutant("rim", "differing part one pixel too narrow", f"{SOURCE}/photometric.cpp", "kRim = 10;", "kRim = 9;"),
 )
 
 
