@@ -188,6 +188,16 @@ class TrainConfig(Part):
         description="After this mark of the 30 000 schedule, and the last growth and pruning, parameters are averaged; "
         "training ends with their mean. 30000: never.",
     )
+    time_window: float = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="Share of the clip, around its middle, whose views training begins with. 1 takes all; less where "
+        "things move so far that all times together average out to nothing.",
+    )
+    time_window_until: int = Field(
+        15_000, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."
+    )
     matrix_step: Literal["muon", "adam"] = Field(
         "muon",
         description="How weight matrices of StaticMLP and DeformNet step. muon: orthogonalised momentum; adam: as the "

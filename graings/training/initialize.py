@@ -18,6 +18,7 @@ from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.training.density import voxel_keys
 from graings.training.streams import Streams
+from graings.training.time_window import TimeWindow
 
 FEATURE_STD = 0.1
 
@@ -74,7 +75,9 @@ def first_points(capture: Capture, images: ImageStore, config: TrainConfig, stre
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
     if not capture.has_alpha or config.init.carve_vote == 0:
         return cube
-    order = torch.randperm(len(capture.train), generator=generator)[:CARVING_VIEWS]
+    window = TimeWindow(config, [frame.time for frame in capture.train])
+    order = torch.randperm(len(capture.train), generator=generator)
+    order = order[[window.has(view, 0) for view in order.tolist()]][:CARVING_VIEWS]
     votes = np.zeros(len(cube), dtype=np.int64)
     seen = np.zeros(len(cube), dtype=np.int64)
     empty = True

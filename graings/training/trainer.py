@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from graings.capture.capture import Capture
+from graings.capture.capture import Capture, Frame
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.errors import DivergedError
@@ -32,6 +32,7 @@ from graings.training.optimizer import Optimizer
 from graings.training.regularisers import regularisers
 from graings.training.snapshots import Snapshots
 from graings.training.streams import Streams, ViewSampler
+from graings.training.time_window import TimeWindow
 
 # Every time training goes back, it goes on with this share of the rates.
 RATE_CUT = 0.5
@@ -87,6 +88,7 @@ class Trainer:
         self.phases = phases(config)
         self.streams = Streams(config.seed)
         self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
+        self.window = TimeWindow(config, [frame.time for frame in capture.train])
         self.times = capture.times
         self.iteration = 0
         self.scene, voxel_size = make_scene(capture, images, config, self.streams)
@@ -117,7 +119,7 @@ class Trainer:
         self.iteration += 1
         phase = self.phase(self.iteration)
         self.scene.temporal = phase.temporal
-        frame = self.capture.train[self.sampler.next()]
+        frame = self._next_frame()
         target = torch.from_numpy(self.images.rgb(frame))
         if len(self.sampler.remaining) > 0:
             self.images.prefetch(self.capture.train[int(self.sampler.remaining[0])])
@@ -171,6 +173,13 @@ class Trainer:
             events=tuple(events),
         )
 
+    def _next_frame(self) -> Frame:
+        """The next view that takes part by now."""
+        view = self.sampler.next()
+        while not self.window.has(view, self.iteration):
+            view = self.sampler.next()
+        return self.capture.train[view]
+
     def regularisers(self, composition: Composition, time: float) -> Tensor:
         """The terms of Eq. 14 on the model itself, with this run's weights and stream of time pairs."""
         return regularisers(self.scene, composition, time, self.times, self.config.loss, self.streams["time_pairs"])
@@ -197,7 +206,10 @@ class Trainer:
             if problem is None and not self.collapse.mended:
                 shift = mend(self.scene)
                 self.collapse.mended = True
-                events.append(f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g})")
+                events.append(
+                    f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g}). "
+                    "Where things move far, train with a `time_window` of 0.1."
+                )
             elif problem is None and self.collapse.missed:  # where the pictures are empty, so may the scene be
                 problem = "nothing was drawn any more, though there was something to see"
         due = self.iteration % every.snapshot_every == 0

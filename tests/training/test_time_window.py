@@ -1,0 +1,58 @@
+"""A training that begins with the middle of the clip."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+
+from graings.config import make_config
+from graings.training.time_window import TimeWindow
+from tests.training.micro import micro_trainer, steps
+
+TIMES = [index / 20 for index in range(21)]
+
+
+def test_the_window_widens_from_the_middle_to_the_whole_clip() -> None:
+    window = TimeWindow(make_config("paper", {"time_window": 0.2, "time_window_until": 11_000, "warmup": 1_000}), TIMES)
+
+    def taking_part(iteration: int) -> list[float]:
+        return [time for view, time in enumerate(TIMES) if window.has(view, iteration)]
+
+    assert taking_part(0) == taking_part(1_000) == [0.4, 0.45, 0.5, 0.55, 0.6]
+    assert window.share(6_000) == pytest.approx(0.6)
+    assert taking_part(10_999) == TIMES[1:-1]
+    assert taking_part(11_000) == taking_part(30_000) == TIMES
+
+
+def test_a_window_narrower_than_the_frames_keeps_the_view_in_the_middle() -> None:
+    window = TimeWindow(make_config("paper", {"time_window": 1e-6}), [0.0, 0.4, 1.0])
+    assert [window.has(view, 0) for view in range(3)] == [False, True, False]
+
+
+def test_views_outside_the_window_are_not_drawn_until_it_is_wide(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = micro_trainer(micro, iterations=60, time_window=0.3)
+    drawn: list[float] = []
+    rgb = trainer.images.rgb
+
+    def noted(frame):  # type: ignore[no-untyped-def]
+        drawn.append(frame.time)
+        return rgb(frame)
+
+    monkeypatch.setattr(trainer.images, "rgb", noted)
+    steps(trainer, 60)
+    assert all(abs(time - 0.5) <= 0.15 for time in drawn[:6])  # the warm-up
+    assert {0.0, 1.0} <= set(drawn[30:])
+
+
+def test_it_is_the_same_after_an_interruption(micro: Path) -> None:
+    options = {"iterations": 40, "time_window": 0.3}
+    whole, first, second = (micro_trainer(micro, **options) for _ in range(3))
+    steps(whole, 20)
+    steps(first, 9)
+    second.load(copy.deepcopy(first.scene), *first.state())
+    steps(second, 11)
+    pairs = zip(whole.scene.parameters(), second.scene.parameters(), strict=True)
+    assert all(torch.equal(one, other) for one, other in pairs)
