@@ -22,6 +22,7 @@ from training_step import Stopwatch, measured_step
 
 from graings import kernel
 from graings.capture.load import load_capture
+from graings.training.average import Average
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 
@@ -51,6 +52,7 @@ def trainer_of(options: argparse.Namespace, share: float, side: int | None) -> T
         keep = torch.rand(count, generator=torch.Generator().manual_seed(0)) < share
         trainer.optimizer.keep(keep)
         trainer.density.statistics.resize(keep=keep)
+        trainer.average = Average()  # that of the checkpoint is of all anchors
     return trainer
 
 

@@ -21,6 +21,7 @@ class TimeWindow:
         self._first = config.time_window
         self._from, self._until = config.scaled(config.warmup), config.scaled(config.time_window_until)
         self._apart = [2 * abs(time - 0.5) for time in times]
+        self._nearest = min(self._apart)
 
     def share(self, iteration: int) -> float:
         """Share of the clip that takes part: as it begins until the warm-up ends, then widening evenly to 1."""
@@ -32,4 +33,4 @@ class TimeWindow:
     def has(self, view: int, iteration: int) -> bool:
         """Whether `view` takes part at `iteration`."""
         share = self.share(iteration)
-        return share >= 1 or self._apart[view] <= max(share, min(self._apart))
+        return share >= 1 or self._apart[view] <= max(share, self._nearest)

@@ -121,8 +121,8 @@ class Trainer:
         self.scene.temporal = phase.temporal
         frame = self._next_frame()
         target = torch.from_numpy(self.images.rgb(frame))
-        if len(self.sampler.remaining) > 0:
-            self.images.prefetch(self.capture.train[int(self.sampler.remaining[0])])
+        if (upcoming := self._upcoming()) is not None:
+            self.images.prefetch(self.capture.train[upcoming])
 
         composition = self.scene.compose(frame.camera.center, frame.time)
         offset = torch.zeros(len(composition.gaussians), 2, requires_grad=True)
@@ -180,6 +180,11 @@ class Trainer:
             view = self.sampler.next()
         return self.capture.train[view]
 
+    def _upcoming(self) -> int | None:
+        """The view that comes next in this pass, or None at its end."""
+        remaining = self.sampler.remaining.tolist()
+        return next((view for view in remaining if self.window.has(view, self.iteration)), None)
+
     def regularisers(self, composition: Composition, time: float) -> Tensor:
         """The terms of Eq. 14 on the model itself, with this run's weights and stream of time pairs."""
         return regularisers(self.scene, composition, time, self.times, self.config.loss, self.streams["time_pairs"])
@@ -200,7 +205,7 @@ class Trainer:
         events: list[str] = []
         scaffold, every = self.scene.scaffold, self.config.guard
         problem = self.guard.problem()
-        last_of_pass = len(self.sampler.remaining) == 0
+        last_of_pass = self._upcoming() is None
         if self.collapse.observe(drawn, scaffold.count * scaffold.slots, loss, last_of_pass=last_of_pass):
             problem = problem or self._lost()
             if problem is None and not self.collapse.mended:

@@ -47,6 +47,17 @@ def test_views_outside_the_window_are_not_drawn_until_it_is_wide(micro: Path, mo
     assert {0.0, 1.0} <= set(drawn[30:])
 
 
+def test_a_pass_ends_with_the_last_view_that_takes_part(micro: Path) -> None:
+    trainer = micro_trainer(micro, iterations=600, time_window=0.3)
+    within = sum(trainer.window.has(view, 1) for view in range(len(trainer.capture.train)))
+    assert 1 < within < len(trainer.capture.train)
+    ends = []
+    for _ in range(3 * within):
+        trainer.step()
+        ends.append(trainer._upcoming() is None)
+    assert ends == ([False] * (within - 1) + [True]) * 3
+
+
 def test_it_is_the_same_after_an_interruption(micro: Path) -> None:
     options = {"iterations": 40, "time_window": 0.3}
     whole, first, second = (micro_trainer(micro, **options) for _ in range(3))
