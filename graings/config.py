@@ -188,12 +188,12 @@ class TrainConfig(Part):
         description="After this mark of the 30 000 schedule, and the last growth and pruning, parameters are averaged; "
         "training ends with their mean. 30000: never.",
     )
-    time_window: float = Field(
-        1.0,
+    time_window: float | None = Field(
+        None,
         gt=0,
         le=1,
-        description="Share of the clip, around its middle, whose views training begins with. 1 takes all; less where "
-        "things move so far that all times together average out to nothing.",
+        description="Share of the clip, around its middle, whose views training begins with; 1 takes all. null: the "
+        "widest in which what the masks show stays in place, which is all of most clips.",
     )
     time_window_until: int = Field(
         15_000, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."

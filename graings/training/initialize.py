@@ -5,17 +5,20 @@ Knows nothing of networks' training; makes a scene that is ready for the first s
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from graings.camera import Camera
-from graings.capture.capture import Capture, Frame
+from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
-from graings.errors import CaptureError
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
+from graings.training.carving import LEAST_COVERED, MIN_CARVED, MIN_VIEWS, SHARES, carve, coverage, masked
 from graings.training.density import voxel_keys
 from graings.training.streams import Streams
 from graings.training.time_window import TimeWindow
@@ -28,19 +31,22 @@ VOXEL_PER_PIXEL = 0.7
 # Voting needs enough views to outvote a few wrong masks, not all of them.
 CARVING_VIEWS = 60
 
-# A mask is dilated by this many pixels, so that a thin moving part still counts as hit.
-MASK_MARGIN = 2
-
-# With fewer carved points than this the vote has failed (masks that never overlap) and is not used.
-MIN_CARVED = 100
-
 NEIGHBOURS = 3
 
 
-def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams) -> tuple[Scene, float]:
-    """A scene ready for the first step, and the voxel size (normalised units)."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """A scene ready for the first step."""
+
+    scene: Scene
+    voxel_size: float  # normalised units
+    time_window: float  # share of the clip that training begins with
+
+
+def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams) -> Start:
+    """A scene of the first anchors. Raises `CaptureError` where no image shows anything."""
     voxel = config.init.voxel_size or VOXEL_PER_PIXEL * pixel_footprint(capture)
-    points = first_points(capture, images, config, streams)
+    points, window = first_points(capture, images, config, streams)
     cells = torch.unique(voxel_keys(torch.from_numpy(points), voxel), dim=0)
     anchors = cells.double() * voxel
     extent = float(torch.quantile(anchors.norm(dim=-1).float(), 0.99)) or 1.0
@@ -53,7 +59,8 @@ def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, stream
         features=torch.randn(count, scene.feature_dim, generator=generator) * FEATURE_STD,
         offsets=torch.randn(count, scene.children, 3, generator=generator) * config.init.offset_std,
     )
-    return Scene(scene, scaffold, extent=extent, initial_opacity=config.init.opacity, seed=config.seed), voxel
+    made = Scene(scene, scaffold, extent=extent, initial_opacity=config.init.opacity, seed=config.seed)
+    return Start(made, voxel, window)
 
 
 def pixel_footprint(capture: Capture) -> float:
@@ -62,41 +69,50 @@ def pixel_footprint(capture: Capture) -> float:
     return max(float(np.median(sizes)), 1e-6)
 
 
-def first_points(capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams) -> NDArray[np.float64]:
-    """Positions [M, 3] to start from: the capture's cloud, else carved random points."""
+def first_points(
+    capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams
+) -> tuple[NDArray[np.float64], float]:
+    """Positions [M, 3] to start from, the capture's cloud or else carved random points, and the `time_window`.
+
+    The window is as configured, or else the widest in which the points still stand for what the images show.
+    """
     generator = streams["init.points"]
+    window = config.time_window or 1.0
     if capture.points is not None:
         points = capture.points.positions
         if len(points) > config.init.max_points:
             chosen = torch.randperm(len(points), generator=generator)[: config.init.max_points]
             points = points[np.sort(chosen.numpy())]
-        return points
+        return points, window
     half = content_half_size(capture)
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
     if not capture.has_alpha or config.init.carve_vote == 0:
-        return cube
-    window = TimeWindow(config, [frame.time for frame in capture.train])
-    order = torch.randperm(len(capture.train), generator=generator)
-    order = order[[window.has(view, 0) for view in order.tolist()]][:CARVING_VIEWS]
-    votes = np.zeros(len(cube), dtype=np.int64)
-    seen = np.zeros(len(cube), dtype=np.int64)
-    empty = True
-    for index in sorted(order.tolist()):
-        frame = capture.train[index]
-        inside, hit, any_mask = _vote(cube, frame, images)
-        seen += inside
-        votes += hit
-        empty &= not any_mask
-    if empty:
-        raise CaptureError(
-            "every mask is empty: there is nothing to see in any training image",
-            file=capture.train[0].name,
-            field="alpha",
-            remedy="Check the alpha channel of the images, or remove it.",
-        )
-    # A point that no view sees is kept out too: nothing could ever train it.
-    kept = cube[(seen > 0) & (votes >= config.init.carve_vote * np.maximum(seen, 1))]
-    return kept if len(kept) >= MIN_CARVED else cube
+        return cube, window
+    order = torch.randperm(len(capture.train), generator=generator).tolist()
+    return _carved(cube, order, capture, images, config) or (cube, window)
+
+
+def _carved(
+    cube: NDArray[np.float64], order: Sequence[int], capture: Capture, images: ImageStore, config: TrainConfig
+) -> tuple[NDArray[np.float64], float] | None:
+    """What the images leave of `cube`, the first views in `order` voting, and the share of the clip; None: nothing."""
+    times = [frame.time for frame in capture.train]
+    # A cell of a picture is a little less than the points' spacing as it appears there.
+    cells = math.ceil(1.25 * len(cube) ** (1 / 3))
+    widest = None
+    for share in SHARES if config.time_window is None else [config.time_window]:
+        window = TimeWindow(config, times, share)
+        chosen = sorted([view for view in order if window.has(view, 0)][:CARVING_VIEWS])
+        if config.time_window is None and share < 1 and len(chosen) < MIN_VIEWS:
+            break
+        views = masked([capture.train[view] for view in chosen], images, config.capture.background_rgb())
+        kept = carve(cube, views, config.init.carve_vote)
+        if len(kept) < MIN_CARVED:
+            continue
+        if coverage(kept, views, cells) >= LEAST_COVERED:
+            return kept, share
+        widest = widest or (kept, share)
+    return widest
 
 
 def content_half_size(capture: Capture) -> float:
@@ -111,35 +127,6 @@ def content_half_size(capture: Capture) -> float:
         for frame in capture.train
     ]
     return max(float(np.median(half)), 1e-3)
-
-
-def _vote(
-    points: NDArray[np.float64], frame: Frame, images: ImageStore
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], bool]:
-    """(in view, on the dilated mask) for each point, and whether the mask has anything."""
-    columns, rows, inside = project(points, frame.camera)
-    alpha = images.alpha(frame)
-    if alpha is None:
-        return inside, inside, True
-    mask = torch.from_numpy(np.ascontiguousarray(alpha > 0.5)).float()[None, None]
-    dilated = torch.nn.functional.max_pool2d(mask, 2 * MASK_MARGIN + 1, stride=1, padding=MASK_MARGIN)[0, 0].numpy() > 0
-    hit = np.zeros(len(points), dtype=np.bool_)
-    hit[inside] = dilated[rows[inside], columns[inside]]
-    return inside, hit, bool(mask.any())
-
-
-def project(
-    points: NDArray[np.float64], camera: Camera
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Pixel column and row of each point, and whether it is in front of the camera and inside the image."""
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depth = np.maximum(local[:, 2], 1e-9)
-    u = camera.fx * local[:, 0] / depth + camera.cx
-    v = camera.fy * local[:, 1] / depth + camera.cy
-    inside = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    columns = np.where(inside, u, 0).astype(np.int64)
-    rows = np.where(inside, v, 0).astype(np.int64)
-    return columns, rows, inside
 
 
 def neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:

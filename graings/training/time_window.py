@@ -14,11 +14,12 @@ from graings.config import TrainConfig
 class TimeWindow:
     """Which views take part at an iteration: those within a share of the clip around its middle, all in the end.
 
-    `times` [V] are the views' times in [0, 1]. The view nearest to the middle always takes part.
+    `times` [V] are the views' times in [0, 1], `first` the share that it begins with. The view nearest to the middle
+    always takes part.
     """
 
-    def __init__(self, config: TrainConfig, times: Sequence[float]) -> None:
-        self._first = config.time_window
+    def __init__(self, config: TrainConfig, times: Sequence[float], first: float) -> None:
+        self._first = first
         self._from, self._until = config.scaled(config.warmup), config.scaled(config.time_window_until)
         self._apart = [2 * abs(time - 0.5) for time in times]
         self._nearest = min(self._apart)

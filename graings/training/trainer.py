@@ -88,12 +88,13 @@ class Trainer:
         self.phases = phases(config)
         self.streams = Streams(config.seed)
         self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
-        self.window = TimeWindow(config, [frame.time for frame in capture.train])
         self.times = capture.times
         self.iteration = 0
-        self.scene, voxel_size = make_scene(capture, images, config, self.streams)
+        start = make_scene(capture, images, config, self.streams)
+        self.scene = start.scene
+        self.window = TimeWindow(config, [frame.time for frame in capture.train], start.time_window)
         self.snapshots = Snapshots()
-        self._attach(voxel_size)
+        self._attach(start.voxel_size)
 
     def _attach(self, voxel_size: float) -> None:
         """Everything whose shape follows the scene, and what watches over it."""
@@ -133,7 +134,7 @@ class Trainer:
         if loss.requires_grad:
             loss.backward()
 
-        events: list[str] = []
+        events = self._opening()
         gradients = self.optimizer.gradients()
         if offset.grad is not None:
             gradients.append(Gradient("the projected centres", SCREEN, offset.grad))
@@ -172,6 +173,13 @@ class Trainer:
             seconds=time.perf_counter() - started,
             events=tuple(events),
         )
+
+    def _opening(self) -> list[str]:
+        """At the first step, what was decided before it; in words."""
+        share = self.window.share(1)
+        if self.iteration > 1 or share == 1:
+            return []
+        return [f"time_window: begins with the middle {share:.0%} of the clip, in which things stay in place"]
 
     def _next_frame(self) -> Frame:
         """The next view that takes part by now."""
@@ -213,7 +221,7 @@ class Trainer:
                 self.collapse.mended = True
                 events.append(
                     f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g}). "
-                    "Where things move far, train with a `time_window` of 0.1."
+                    "Where things move far, train with a smaller `time_window`."
                 )
             elif problem is None and self.collapse.missed:  # where the pictures are empty, so may the scene be
                 problem = "nothing was drawn any more, though there was something to see"

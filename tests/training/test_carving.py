@@ -1,0 +1,99 @@
+"""Which points the images allow, and for how much of the clip."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.capture.synthetic import Body, SyntheticScene, write_synthetic
+from graings.config import TrainConfig, make_config
+from graings.training.carving import carve, coverage, masked
+from graings.training.initialize import first_points
+from graings.training.streams import Streams
+from tests.training.micro import GROWING, micro_trainer, quality, said, steps
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small ball that flies to and fro, three times its own width, and turns around at the middle of the clip."""
+    ball = Body(
+        home=np.zeros(3),
+        swing=np.array([0.8, 0.3, 0.0]),
+        semi_axes=np.full(3, 0.24),
+        axis=np.array([0.0, 0.0, 1.0]),
+        colors=np.array([[0.8, 0.1, 0.1], [0.3, 0.1, 0.1]]),
+        phases=np.full(6, math.pi / 2),
+    )
+    monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((ball,))))
+    return write_synthetic(tmp_path / "flight", frames=48, size=40)
+
+
+def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
+    data = load_capture(capture, config.capture)
+    points, window = first_points(data, ImageStore(WHITE), config, Streams(0))
+    return len(points), window
+
+
+def test_a_clip_in_which_nothing_stays_in_place_begins_with_a_part_of_it(flight: Path) -> None:
+    count, window = _found(flight, make_config("draft"))
+    assert 0.1 <= window < 1
+    assert 100 <= count < 6_000  # of 60 000
+    assert _found(flight, make_config("draft", {"time_window": 1.0})) == (60_000, 1.0)
+
+
+def test_a_clip_in_which_things_stay_in_place_begins_as_a_whole(tmp_path: Path) -> None:
+    capture = write_synthetic(tmp_path / "c", seed=1, frames=24, size=40)
+    for options in ({}, {"time_window": 1.0}):
+        count, window = _found(capture, make_config("draft", options))
+        assert (count < 30_000, window) == (True, 1.0)
+
+
+def test_what_flies_is_not_lost(flight: Path) -> None:
+    found = []
+    for options in ({}, {"time_window": 1.0}):
+        trainer = micro_trainer(flight, iterations=400, **{"init.points": 20_000}, **GROWING, **options)
+        reports = steps(trainer, 400)
+        assert len(said(reports[:1], "time_window: begins with the middle")) == (0 if options else 1)
+        assert said(reports[1:], "time_window") == []
+        found.append(quality(trainer))
+    print(f"by itself {found[0]:.2f} dB, the whole clip from the start {found[1]:.2f} dB")
+    assert found[0] > found[1] + 2
+
+
+def test_too_few_views_do_not_speak_for_a_part_of_the_clip(flight: Path) -> None:
+    config = make_config("draft")
+    data = load_capture(flight, config.capture)
+    few = replace(data, train=data.train[::4])
+    assert first_points(few, ImageStore(WHITE), config, Streams(0))[1] == 1.0
+
+
+def test_what_looks_like_the_background_has_no_points(flight: Path) -> None:
+    data = load_capture(flight)
+    red, none = (masked(data.train[:4], ImageStore(colour), colour) for colour in (WHITE, (0.0, 0.0, 0.0)))
+    for one, other in zip(red, none, strict=True):
+        alpha = ImageStore(WHITE).alpha(one.frame)
+        assert alpha is not None
+        assert np.array_equal(one.mask, alpha > 0.5)
+        assert np.array_equal(one.mask, other.mask)
+    row, column = (int(index[0]) for index in red[0].mask.nonzero())
+    own = ImageStore(WHITE).rgb(data.train[0])[row, column].tolist()
+    assert masked(data.train[:1], ImageStore(WHITE), own)[0].mask.sum() < red[0].mask.sum()
+
+
+def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
+    data = load_capture(flight)
+    views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.4, 1.4, 40)] * 3), axis=-1).reshape(-1, 3)
+    kept = carve(grid, views, 0.6)
+    assert 0 < len(kept) < 0.05 * len(grid)
+    assert coverage(kept, views, 50) > 0.9
+    assert coverage(kept + 5, views, 50) == 0
+    assert coverage(kept[:1], views, 50) < coverage(kept, views, 50)
