@@ -102,11 +102,8 @@ def open_model(path: Path) -> Model:
 
 def can_be_seen(scene: Scene) -> Bool[Tensor, " anchor"]:
     """Which anchors have a child that may be drawn at some time from somewhere; the others never change a pixel."""
-    if scene.config.opacity_view:
-        return torch.ones(scene.scaffold.count, dtype=torch.bool)
     with torch.no_grad():
-        features = scene.scaffold.features
-        logits = scene.appearance.opacity_logits(features, torch.zeros_like(scene.scaffold.anchors))
+        logits = scene.appearance.highest_opacity_logits(scene.scaffold.features)
         highest = torch.tanh(logits + scene.scaffold.opacity_offsets.unsqueeze(-1)).amax(-1)
     # The residual is bounded; a hundredth of its bound covers what half precision does to a score.
     reach = 1.01 * scene.residual.scale if scene.residual is not None else 0.0

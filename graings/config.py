@@ -63,6 +63,9 @@ class SceneConfig(Part):
         "input: one network of position and time.",
     )
     time_frequencies: int = Field(6, ge=0, le=16, description="Octaves of the time encoding (L).")
+    time_width: int = Field(
+        256, ge=4, le=4096, description="Hidden width of psi, the function of time in a product; it runs once a frame."
+    )
     residual_scale: float = Field(0.1, ge=0, le=1, description="Bound of the appearance residual (eta).")
     deformation: Literal["child", "anchor", "none"] = Field(
         "child", description="child: an offset per Gaussian (the method); anchor: broadcast per anchor; none: static."
@@ -72,7 +75,14 @@ class SceneConfig(Part):
     residual: bool = Field(True, description="Temporal appearance residual (Eq. 12).")
     residual_stop_gradient: bool = Field(True, description="Detach the anchor feature before the residual field.")
     canonical: bool = Field(True, description="Ablation when off: no canonical geometry branch and no warm-up.")
-    opacity_view: bool = Field(False, description="Feed the viewing direction to the opacity head.")
+    direction_degree: int = Field(
+        3,
+        ge=1,
+        le=3,
+        description="Degree up to which the colour head sees spherical harmonics of the viewing direction; 1 is the "
+        "direction itself.",
+    )
+    opacity_view: bool = Field(False, description="Feed the viewing direction to the opacity head, as the paper does.")
     projected_clip: bool = Field(True, description="Let clipped values receive gradients that point back inside.")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from torch import Tensor
@@ -18,6 +18,9 @@ from graings.config import SceneConfig, TrainConfig, restored
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.units import Units
+
+# What the facts of a model do not say is as it was before there was a choice.
+BEFORE: Final = {"deform_time": "input", "time_width": 64, "direction_degree": 1}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +72,7 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
     Raises `CheckpointError` for options of another version, and whatever broken facts provoke.
     """
     config = restored(TrainConfig, facts["config"], path)
-    # Where the facts do not say how time enters, they are older than the other way.
-    shape = restored(SceneConfig, {"deform_time": "input"} | facts["scene_config"], path)
+    shape = restored(SceneConfig, BEFORE | facts["scene_config"], path)
     rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
     scene = Scene(shape, Scaffold(**rows), extent=float(tensors["extent"]), initial_opacity=0.1)
     scene.load_state_dict(tensors)

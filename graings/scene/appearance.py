@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from graings.config import SceneConfig
-from graings.scene.encoding import encoding_width, frequency_encoding
+from graings.scene.encoding import direction_encoding, direction_width, encoding_width, frequency_encoding
 from graings.scene.perceptron import perceptron, weights_and_biases
 from graings.scene.saturate import sigmoid, tanh
 
@@ -21,15 +21,17 @@ from graings.scene.saturate import sigmoid, tanh
 class CanonicalAppearance(nn.Module):
     """F_c and F_o: (f_a, v) -> colour in (0, 1) and opacity score in (-1, 1) per child slot, Eq. 11.
 
-    With `opacity_view` off F_o sees the feature only: in a monocular capture the viewing direction names the
-    frame, and opacity could then switch children per frame instead of moving them (decision 8).
+    F_c sees v as spherical harmonics up to `direction_degree`: a highlight is narrower than what one hidden layer makes
+    of the direction itself. With `opacity_view` off F_o sees the feature only (decision 8).
     """
 
     def __init__(self, config: SceneConfig, initial_opacity: float) -> None:
         super().__init__()
         k, width = config.children, config.head_width
         self.opacity_view = config.opacity_view
-        self.color = nn.Sequential(nn.Linear(config.feature_dim + 3, width), nn.ReLU(), nn.Linear(width, 3 * k))
+        self.direction_degree = config.direction_degree
+        color_inputs = config.feature_dim + direction_width(config.direction_degree)
+        self.color = nn.Sequential(nn.Linear(color_inputs, width), nn.ReLU(), nn.Linear(width, 3 * k))
         opacity_inputs = config.feature_dim + (3 if config.opacity_view else 0)
         self.opacity = nn.Sequential(nn.Linear(opacity_inputs, width), nn.ReLU(), nn.Linear(width, k))
         last = self.opacity[-1]
@@ -45,7 +47,8 @@ class CanonicalAppearance(nn.Module):
         children: Int64[Tensor, " drawn"],
     ) -> Float[Tensor, "drawn 3"]:
         """c_can of the given flat child slots (anchor * k + child)."""
-        raw = perceptron(torch.cat([features, directions], dim=-1), *weights_and_biases(self.color))
+        inputs = torch.cat([features, direction_encoding(directions, self.direction_degree)], dim=-1)
+        raw = perceptron(inputs, *weights_and_biases(self.color))
         return sigmoid(raw.view(-1, 3).index_select(0, children))
 
     def opacity_logits(
@@ -54,6 +57,19 @@ class CanonicalAppearance(nn.Module):
         """F_o before the tanh, for every child slot."""
         inputs = torch.cat([features, directions], dim=-1) if self.opacity_view else features
         return perceptron(inputs, *weights_and_biases(self.opacity))
+
+    def highest_opacity_logits(self, features: Float[Tensor, "anchor feature"]) -> Float[Tensor, "anchor child"]:
+        """A bound of `opacity_logits` over all viewing directions; without them, `opacity_logits` itself.
+
+        A unit vector moves what enters a hidden unit by no more than the length of its weights, and each weight of the
+        last layer then meets the end that suits it.
+        """
+        weights, biases = weights_and_biases(self.opacity)
+        middle = features @ weights[0][:, : features.shape[-1]].T + biases[0]
+        reach = weights[0][:, features.shape[-1] :].norm(dim=-1)
+        least, most = (middle - reach).relu(), (middle + reach).relu()
+        highest: Tensor = most @ weights[1].clamp_min(0).T + least @ weights[1].clamp_max(0).T + biases[1]
+        return highest
 
 
 class ResidualField(nn.Module):

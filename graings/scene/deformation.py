@@ -19,9 +19,6 @@ from graings.scene.children import Children
 from graings.scene.encoding import encoding_width, frequency_encoding
 from graings.scene.perceptron import Shared, perceptron, weights_and_biases
 
-# Hidden width of psi. It runs once a frame.
-TIME_WIDTH = 64
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deformation:
@@ -78,7 +75,8 @@ def time_modules(config: SceneConfig) -> tuple[nn.Linear | None, nn.Sequential |
     width, time_width = config.deform_width, encoding_width(1, config.time_frequencies)
     if config.deform_time == "input":
         return nn.Linear(time_width, width, bias=False), None
-    return None, nn.Sequential(nn.Linear(time_width, TIME_WIDTH), nn.ReLU(), nn.Linear(TIME_WIDTH, width))
+    hidden = config.time_width
+    return None, nn.Sequential(nn.Linear(time_width, hidden), nn.ReLU(), nn.Linear(hidden, width))
 
 
 class SingleMLP(nn.Module):

@@ -1,10 +1,12 @@
-"""Frequency encoding of positions and times.
+"""Encodings: frequencies of positions and times, spherical harmonics of directions.
 
 Positions are constants to the networks that read them (Eq. 7), so that the kernel encodes them and nothing is kept
-for a way back. Knows nothing of what is encoded.
+for a way back. Knows nothing of the networks.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from jaxtyping import Float
@@ -38,3 +40,33 @@ def plain_frequency_encoding(x: Float[Tensor, "*batch dim"], octaves: int) -> Fl
     frequencies = 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device)
     phases = (x.unsqueeze(-1) * frequencies).flatten(-2)
     return torch.cat([x, phases.sin(), phases.cos()], dim=-1)
+
+
+def direction_width(degree: int) -> int:
+    """Length of the encoding of a direction: the real spherical harmonics of degrees 1 to `degree`."""
+    return degree * (degree + 2)
+
+
+def direction_encoding(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch width"]:
+    """Real spherical harmonics of degrees 1 to `degree` (at most 3) of unit vectors; a bias is that of degree 0.
+
+    Scaled so that those of degree 1 are the direction itself: each has the mean square 1/3 over all directions.
+    """
+    x, y, z = directions.unbind(-1)
+    harmonics = [x, y, z]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        a = math.sqrt(5)
+        harmonics += [a * x * y, a * y * z, a / math.sqrt(12) * (3 * zz - 1), a * x * z, a / 2 * (xx - yy)]
+    if degree >= 3:
+        b, c, d = math.sqrt(35 / 24), math.sqrt(35), math.sqrt(7 / 8)
+        harmonics += [
+            b * y * (3 * xx - yy),
+            c * x * y * z,
+            d * y * (5 * zz - 1),
+            math.sqrt(7 / 12) * z * (5 * zz - 3),
+            d * x * (5 * zz - 1),
+            c / 2 * z * (xx - yy),
+            b * x * (xx - 3 * yy),
+        ]
+    return torch.stack(harmonics, dim=-1)

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from torch.nn import functional
 
 from graings import constants, kernel
 from graings.scene.clip import clip
-from graings.scene.encoding import encoding_width, frequency_encoding, plain_frequency_encoding
+from graings.scene.encoding import (
+    direction_encoding,
+    direction_width,
+    encoding_width,
+    frequency_encoding,
+    plain_frequency_encoding,
+)
 from tests.models import EYE, tiny_scene
 
 
@@ -164,6 +172,34 @@ def test_encoding_is_differentiable_where_positions_are_not_constants() -> None:
     assert torch.autograd.gradcheck(lambda x: frequency_encoding(x, 3), (x,))
     with torch.no_grad():
         assert torch.allclose(frequency_encoding(x, 3), plain_frequency_encoding(x, 3))
+
+
+@pytest.mark.parametrize("view", [True, False])
+def test_no_direction_gives_more_than_the_highest_opacity(view: bool) -> None:
+    appearance, features = (scene := tiny_scene(opacity_view=view)).appearance, scene.scaffold.features
+    highest = appearance.highest_opacity_logits(features)
+    directions = functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    found = torch.stack([appearance.opacity_logits(features, d.expand(len(features), 3)) for d in directions])
+    assert (found <= highest + 1e-6).all()
+    if view:  # a bound that is never near would be of no use
+        assert (highest - found.amax(0)).max() < 0.5
+    else:
+        assert torch.allclose(found.amax(0), highest, atol=1e-6)
+
+
+def test_direction_encoding_begins_with_the_direction_and_takes_each_harmonic_once() -> None:
+    # The rule is exact for products of two harmonics: Gauss nodes along the axis, even steps around it.
+    heights, shares = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(4))
+    angles = torch.arange(8, dtype=torch.float64) * math.pi / 4
+    radii = (1 - heights * heights).sqrt().unsqueeze(1)
+    sphere = torch.stack([radii * angles.cos(), radii * angles.sin(), heights.unsqueeze(1).expand(4, 8)], dim=-1)
+    for degree in (1, 2, 3):
+        encoded = direction_encoding(sphere, degree)
+        assert encoded.shape[-1] == direction_width(degree)
+        assert torch.equal(encoded[..., :3], sphere)
+        weighed = encoded * (shares / 16).view(4, 1, 1)
+        products = weighed.flatten(0, 1).T @ encoded.flatten(0, 1)
+        assert torch.allclose(products, torch.eye(direction_width(degree), dtype=torch.float64) / 3, atol=1e-15)
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf])

@@ -16,6 +16,7 @@ from graings.config import TrainConfig, make_config
 from graings.errors import CheckpointError
 from graings.evaluation import evaluate, evaluate_run
 from graings.metrics import SplitMetrics
+from graings.model import BEFORE
 from graings.training.run import TrainingRun
 
 ITERATIONS = 60
@@ -274,12 +275,14 @@ def test_options_of_another_version_are_named_and_not_taken_for_damage(capture: 
             read(tmp_path / "run")
 
 
-def test_a_model_from_before_time_entered_as_a_product_is_still_read(capture: Path, tmp_path: Path) -> None:
-    list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=12, **{"scene.deform_time": "input"})))
-    expected = load_model(tmp_path / "run").scene
+@pytest.mark.parametrize(("name", "before"), BEFORE.items())
+def test_a_model_from_before_a_choice_is_still_read(capture: Path, tmp_path: Path, name: str, before: object) -> None:
+    list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=12, **{f"scene.{name}": before})))
+    expected = load_model(tmp_path / "run").scene.gaussians((0.0, -3.0, 0.0), 0.7)
     for path in (tmp_path / "run").glob("checkpoints/*/checkpoint.json"):
         facts = json.loads(path.read_text())
-        del facts["scene_config"]["deform_time"], facts["config"]["scene"]["deform_time"]
+        del facts["scene_config"][name], facts["config"]["scene"][name]
         path.write_text(json.dumps(facts))
-    found = load_model(tmp_path / "run").scene
-    assert torch.equal(found.gaussians((0.0, -3.0, 0.0), 0.7).means, expected.gaussians((0.0, -3.0, 0.0), 0.7).means)
+    found = load_model(tmp_path / "run").scene.gaussians((0.0, -3.0, 0.0), 0.7)
+    assert torch.equal(found.means, expected.means)
+    assert torch.equal(found.colors, expected.colors)

@@ -344,15 +344,23 @@ def _drive(trainer: Trainer, layer: nn.Module, bias: float) -> None:
 
 @pytest.mark.parametrize("bias", [20.0, -20.0])
 def test_saturated_colours_come_back(micro: Path, bias: float) -> None:
-    """E10: logits at 20 give a gradient of exactly 0 where it is formed from the value."""
+    """E10: logits at 20 give a gradient of exactly 0 where it is formed from the value.
+
+    Biases may stay where they are: what brings the colours back is mostly the weights.
+    """
     trainer = micro_trainer(micro, **{"rates.color": [0.1, 0.1]})
-    last = trainer.scene.appearance.color[-1]
-    assert isinstance(last, nn.Linear)
-    _drive(trainer, last, bias)
+    _drive(trainer, trainer.scene.appearance.color[-1], bias)
+    frame = trainer.capture.train[0]
+
+    def moderate() -> float:
+        colors = trainer.scene.compose(frame.camera.center, frame.time).gaussians.colors
+        return float(((colors > 1e-3) & (colors < 1 - 1e-3)).float().mean())
+
     before = quality(trainer)
+    assert moderate() == 0
     steps(trainer, 200)
-    assert float(last.bias.detach().abs().min()) < 19.0
-    assert quality(trainer) > before
+    assert moderate() > 0.2
+    assert quality(trainer) > before + 5
 
 
 def test_a_saturated_opacity_has_a_gradient_and_falls_where_the_data_want_it(micro: Path) -> None:
