@@ -206,7 +206,7 @@ class TrainConfig(Part):
         "widest in which what the masks show stays in place, which is all of most clips.",
     )
     time_window_until: int = Field(
-        15_000, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."
+        7_500, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."
     )
     matrix_step: Literal["muon", "adam"] = Field(
         "muon",
