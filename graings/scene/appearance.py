@@ -22,7 +22,8 @@ class CanonicalAppearance(nn.Module):
     """F_c and F_o: (f_a, v) -> colour in (0, 1) and opacity score in (-1, 1) per child slot, Eq. 11.
 
     F_c sees v as spherical harmonics up to `direction_degree`: a highlight is narrower than what one hidden layer makes
-    of the direction itself. With `opacity_view` off F_o sees the feature only (decision 8).
+    of the direction itself. With `opacity_view` off F_o sees the feature only: in a monocular capture the viewing
+    direction names the frame, and opacity could then switch children per frame instead of moving them (decision 8).
     """
 
     def __init__(self, config: SceneConfig, initial_opacity: float) -> None:

@@ -46,17 +46,20 @@ class Masked:
 
 
 def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> list[Masked]:
-    """What each of `frames` shows: where it is opaque and not of the background's colour.
+    """What each of `frames` shows: where it is opaque and not of the background's colour; all of it without alpha.
 
     Raises `CaptureError` where all are transparent everywhere.
     """
     found, opaque = [], False
     for frame in frames:
         alpha = images.alpha(frame)
-        solid = np.ones((frame.camera.height, frame.camera.width), np.bool_) if alpha is None else alpha > 0.5
+        if alpha is None:  # what lies behind is in the picture, whatever its colour
+            solid = mask = np.ones((frame.camera.height, frame.camera.width), np.bool_)
+        else:
+            solid = alpha > 0.5
+            mask = solid & (np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > CONTRAST)
         opaque |= bool(solid.any())
-        differs = np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > CONTRAST
-        found.append(Masked(frame, solid & differs))
+        found.append(Masked(frame, mask))
     if not opaque:
         raise CaptureError(
             "every mask is empty: there is nothing to see in any training image",

@@ -179,7 +179,7 @@ class Trainer:
         share = self.window.share(1)
         if self.iteration > 1 or share == 1:
             return []
-        return [f"time_window: begins with the middle {share:.0%} of the clip, in which things stay in place"]
+        return [f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens"]
 
     def _next_frame(self) -> Frame:
         """The next view that takes part by now."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from graings.capture.image_file import decode
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import Body, SyntheticScene, write_synthetic
@@ -16,6 +17,7 @@ from graings.config import TrainConfig, make_config
 from graings.training.carving import carve, coverage, masked
 from graings.training.initialize import first_points
 from graings.training.streams import Streams
+from tests.capture.captures import write_image
 from tests.training.micro import GROWING, micro_trainer, quality, said, steps
 
 WHITE = (1.0, 1.0, 1.0)
@@ -86,6 +88,15 @@ def test_what_looks_like_the_background_has_no_points(flight: Path) -> None:
     row, column = (int(index[0]) for index in red[0].mask.nonzero())
     own = ImageStore(WHITE).rgb(data.train[0])[row, column].tolist()
     assert masked(data.train[:1], ImageStore(WHITE), own)[0].mask.sum() < red[0].mask.sum()
+
+
+def test_a_picture_without_alpha_shows_something_everywhere(tmp_path: Path) -> None:
+    capture = write_synthetic(tmp_path / "c", seed=1, frames=2, size=20)
+    pixels = decode(capture / "train/r_000.png", "r_000")
+    write_image(capture / "train/r_000.png", np.full((*pixels.shape[:2], 3), 255, np.uint8))  # the background's colour
+    first, second = masked(load_capture(capture).train, ImageStore(WHITE), WHITE)
+    assert first.mask.all()
+    assert 0 < second.mask.sum() < second.mask.size
 
 
 def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
