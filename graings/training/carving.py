@@ -39,35 +39,36 @@ MIN_VIEWS: Final = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Masked:
-    """A frame and where it shows something, [H, W]."""
+    """A frame, where it shows something, [H, W], and whether any of it is opaque, of whatever colour."""
 
     frame: Frame
     mask: NDArray[np.bool_]
+    opaque: bool
 
 
 def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> list[Masked]:
-    """What each of `frames` shows: where it is opaque and not of the background's colour; all of it without alpha.
-
-    Raises `CaptureError` where all are transparent everywhere.
-    """
-    found, opaque = [], False
+    """What each of `frames` shows: where it is opaque and not of the background's colour; all of it without alpha."""
+    found = []
     for frame in frames:
         alpha = images.alpha(frame)
         if alpha is None:  # what lies behind is in the picture, whatever its colour
-            solid = mask = np.ones((frame.camera.height, frame.camera.width), np.bool_)
+            mask = opaque = np.ones((frame.camera.height, frame.camera.width), np.bool_)
         else:
-            solid = alpha > 0.5
-            mask = solid & (np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > CONTRAST)
-        opaque |= bool(solid.any())
-        found.append(Masked(frame, mask))
-    if not opaque:
+            opaque = alpha > 0.5
+            mask = opaque & (np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > CONTRAST)
+        found.append(Masked(frame, mask, bool(opaque.any())))
+    return found
+
+
+def refuse_empty(views: Sequence[Masked]) -> None:
+    """Raise `CaptureError` where all of `views` are transparent everywhere."""
+    if not any(view.opaque for view in views):
         raise CaptureError(
             "every mask is empty: there is nothing to see in any training image",
-            file=frames[0].name,
+            file=views[0].frame.name,
             field="alpha",
             remedy="Check the alpha channel of the images, or remove it.",
         )
-    return found
 
 
 def carve(points: NDArray[np.float64], views: Sequence[Masked], vote: float) -> NDArray[np.float64]:

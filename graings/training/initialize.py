@@ -18,7 +18,17 @@ from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
-from graings.training.carving import LEAST_COVERED, MIN_CARVED, MIN_VIEWS, SHARES, carve, coverage, masked
+from graings.training.carving import (
+    LEAST_COVERED,
+    MIN_CARVED,
+    MIN_VIEWS,
+    SHARES,
+    Masked,
+    carve,
+    coverage,
+    masked,
+    refuse_empty,
+)
 from graings.training.density import voxel_keys
 from graings.training.streams import Streams
 from graings.training.time_window import TimeWindow
@@ -99,13 +109,19 @@ def _carved(
     times = [frame.time for frame in capture.train]
     # A cell of a picture is a little less than the points' spacing as it appears there.
     cells = math.ceil(1.25 * len(cube) ** (1 / 3))
-    widest = None
-    for share in SHARES if config.time_window is None else [config.time_window]:
+
+    def seen(share: float) -> list[Masked]:
         window = TimeWindow(config, times, share)
         chosen = sorted([view for view in order if window.has(view, 0)][:CARVING_VIEWS])
-        if config.time_window is None and share < 1 and len(chosen) < MIN_VIEWS:
+        return masked([capture.train[view] for view in chosen], images, config.capture.background_rgb())
+
+    whole = seen(1.0)
+    refuse_empty(whole)  # in a part of the clip all may be out of sight
+    widest = None
+    for share in SHARES if config.time_window is None else [config.time_window]:
+        views = whole if share == 1 else seen(share)
+        if config.time_window is None and share < 1 and len(views) < MIN_VIEWS:
             break
-        views = masked([capture.train[view] for view in chosen], images, config.capture.background_rgb())
         kept = carve(cube, views, config.init.carve_vote)
         if len(kept) < MIN_CARVED:
             continue

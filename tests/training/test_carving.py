@@ -77,6 +77,14 @@ def test_too_few_views_do_not_speak_for_a_part_of_the_clip(flight: Path) -> None
     assert first_points(few, ImageStore(WHITE), config, Streams(0))[1] == 1.0
 
 
+@pytest.mark.parametrize("window", [None, 0.25])
+def test_a_clip_with_nothing_in_sight_at_its_middle_is_not_taken_for_empty(flight: Path, window: float | None) -> None:
+    for frame in load_capture(flight).train:
+        if abs(frame.time - 0.5) < 0.3:
+            write_image(frame.image_path, np.zeros((40, 40, 4), np.uint8))
+    assert _found(flight, make_config("draft", {"time_window": window})) == (60_000, window or 1.0)
+
+
 def test_what_looks_like_the_background_has_no_points(flight: Path) -> None:
     data = load_capture(flight)
     red, none = (masked(data.train[:4], ImageStore(colour), colour) for colour in (WHITE, (0.0, 0.0, 0.0)))
