@@ -7,8 +7,8 @@ every time and the mean over five frames around each stays within 4 levels of 25
 is flicker, as RMS and largest deviation in levels. There is no truth for one camera at all times, so this measures
 steadiness and not error.
 
-Between frames: PSNR of training views, of held-out views whose time a training view shares (to a hundredth of the
-training spacing), and of those in between, with the spacing.
+Between frames: PSNR of training views and of held-out views by how far the nearest training time is, in steps of the
+training spacing; 0 is a held-out view at a training time (to a hundredth of a step).
 
 Prints a row for each run and writes FOLDER/temporal.json and, for each run, FOLDER/NAME.png: 24 frames of the clip.
 """
@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -60,26 +61,26 @@ def flicker(colors: np.ndarray, alphas: np.ndarray) -> dict[str, float | None]:
     }
 
 
-def error_in_time(run: Path, model: Model) -> dict[str, float | None]:
-    """Mean PSNR in dB of training views, held-out views at training times and held-out views between them."""
+def error_in_time(run: Path, model: Model) -> dict[str, Any]:
+    """Mean PSNR in dB of training views and, by steps to the nearest training time, of held-out views; how many."""
     root = json.loads((run / "run.json").read_text())["capture"]["path"]
     capture = load_capture(Path(root), model.config.capture)
     images = ImageStore(model.background, model.config.capture.cache_mb)
     times = np.unique([frame.time for frame in capture.train])
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
 
-    def psnr(frames: list[Frame]) -> float | None:
-        return evaluate(model.scene, frames, images, model.background).psnr if frames else None
+    apart: dict[int, list[Frame]] = {}
+    for frame in capture.val:
+        steps = float(np.abs(times - frame.time).min()) / spacing
+        apart.setdefault(0 if steps <= 0.01 else max(1, round(steps)), []).append(frame)
 
-    def apart(frame: Frame) -> float:
-        return float(np.abs(times - frame.time).min()) / spacing
+    def psnr(frames: Sequence[Frame]) -> float:
+        return evaluate(model.scene, frames, images, model.background).psnr
 
     return {
         "spacing": spacing,
-        "train": psnr(list(subset(capture.train, 40))),
-        "at_training_times": psnr([frame for frame in capture.val if apart(frame) <= 0.01]),
-        "between": psnr([frame for frame in capture.val if apart(frame) > 0.01]),
-        "median_distance": statistics.median(apart(frame) for frame in capture.val),
+        "train": psnr(subset(capture.train, 40)),
+        "held_out": {steps: {"psnr": psnr(apart[steps]), "views": len(apart[steps])} for steps in sorted(apart)},
     }
 
 
@@ -94,8 +95,14 @@ def main() -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     torch.set_grad_enabled(False)
     document = {}
+    if len({run.name for run in options.runs}) < len(options.runs):
+        parser.error("two of the runs have the same folder name, which names their row and picture: rename one")
     for run in options.runs:
         model = load_model(run)
+        if options.view not in range(len(model.views["val"])):
+            parser.error(
+                f"{run}: has no validation view {options.view}: give another --view, or a capture with a val split"
+            )
         colors, alphas = clip(model, options.view, options.frames)
         document[run.name] = {**flicker(colors, alphas), **error_in_time(run, model)}
         chosen = colors[np.linspace(0, len(colors) - 1, SHOWN[0] * SHOWN[1]).round().astype(int)]

@@ -56,16 +56,16 @@ def _painted(
 
 @pytest.mark.parametrize("factor", [1e-4, 1e5])
 def test_a_tiny_or_huge_world_trains_as_well_as_any(micro: Path, tmp_path: Path, factor: float) -> None:
-    """D09: 100 iterations; the scale is only a power of two, so rounding and voxels differ a little."""
+    """D09: 300 iterations; units of length are a power of two times normalised ones, so rounding differs."""
     qualities = []
     for capture in (micro, _scaled(micro, tmp_path / "scaled", factor)):
-        trainer = micro_trainer(capture, **{"init.points": 400})
+        trainer = micro_trainer(capture, iterations=300, **{"init.points": 400})
         assert trainer.step().gaussians > 0
-        steps(trainer, 119)
+        steps(trainer, 299)
         assert finite(trainer)
         qualities.append(quality(trainer))
     assert min(qualities) > 20
-    assert abs(qualities[1] - qualities[0]) < 3
+    assert abs(qualities[1] - qualities[0]) < 0.3
 
 
 @pytest.mark.parametrize("exponent", [-13, 17])

@@ -445,9 +445,10 @@ def test_children_born_in_one_place_part(micro: Path) -> None:
     assert float(apart.min()) > 0
 
 
-def test_growing_does_not_tear_the_picture(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """E19: quality right before and right after each growth."""
-    trainer = micro_trainer(micro, **GROWING, **{"density.newborn_opacity": 0.02})
+@pytest.mark.parametrize("newborn", [None, 0.02])
+def test_growing_does_not_tear_the_picture(micro: Path, monkeypatch: pytest.MonkeyPatch, newborn: float | None) -> None:
+    """E19: quality right before and right after each growth; newborns as opaque as their parent, and faint ones."""
+    trainer = micro_trainer(micro, **GROWING, **{"density.newborn_opacity": newborn})
     drops: list[float] = []
     grow = trainer.density.grow
 

@@ -233,7 +233,8 @@ NB_MODULE(_kernel, m) {
     m.def("hidden_size", &graings::hidden_size, "widths"_a, "rows"_a, "Elements that a network's hidden activations take.");
     m.def("keep_freed_memory", [] {
 #ifdef __GLIBC__
-        mallopt(M_MMAP_THRESHOLD, 32 << 20);  // the most it accepts
+        // A threshold would not do: glibc accepts 32 MB at most, and activations of 21 000 rows of 3 x 128 are larger.
+        mallopt(M_MMAP_MAX, 0);
         mallopt(M_TRIM_THRESHOLD, 1 << 30);
 #endif
     });
