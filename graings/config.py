@@ -100,18 +100,12 @@ class InitConfig(Part):
 
 
 class LossConfig(Part):
-    """Weights of Eq. 14-18 and of one more; the l_* switches are the paper's ablations. Owner: `graings.training`."""
+    """Weights of Eq. 14-18; the l_* switches are the paper's ablations. Owner: `graings.training.losses`."""
 
     ssim: float = Field(0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss.")
     temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
     deformation: float = Field(0.001, ge=0, description="lambda_2, magnitude of the deformation.")
     residual: float = Field(0.01, ge=0, description="lambda_3, magnitude of the appearance residual.")
-    silhouette: float = Field(
-        0.3,
-        ge=0,
-        description="Weight of the opacity that a mask asks for and a colour near the background's leaves open; left "
-        "out where next to nothing has that colour, or most has.",
-    )
     gain: float = Field(1.0, ge=0, description="Common factor on the three means over children (decision 10).")
     temporal_share: float = Field(0.1, gt=0, le=1, description="Share of drawn children in the temporal term per step.")
     l_temp: bool = Field(True, description="Ablation switch of the temporal term.")

@@ -18,7 +18,9 @@ from graings.camera import Camera
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.errors import CaptureError
-from graings.training.silhouette import opaque_and_hidden
+
+# What differs from the background by less than this in every channel needs no Gaussians.
+CONTRAST: Final = 8 / 255
 
 # A mask is dilated by this many pixels, so that a thin moving part still counts as hit.
 MASK_MARGIN: Final = 2
@@ -48,8 +50,13 @@ def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[flo
     """What each of `frames` shows: where it is opaque and not of the background's colour; all of it without alpha."""
     found = []
     for frame in frames:
-        opaque, hidden = opaque_and_hidden(frame, images, background)
-        found.append(Masked(frame, opaque & ~hidden, bool(opaque.any())))
+        alpha = images.alpha(frame)
+        if alpha is None:  # what lies behind is in the picture, whatever its colour
+            mask = opaque = np.ones((frame.camera.height, frame.camera.width), np.bool_)
+        else:
+            opaque = alpha > 0.5
+            mask = opaque & (np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > CONTRAST)
+        found.append(Masked(frame, mask, bool(opaque.any())))
     return found
 
 

@@ -96,8 +96,6 @@ class TrainingRun:
         stored = facts.get("config")
         if isinstance(stored, dict):  # what a run does not say is as it was when there was no choice
             stored = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS, "time_window": 1.0} | stored
-            if isinstance(loss := stored.get("loss"), dict):
-                stored |= {"loss": {"silhouette": 0.0, **loss}}
         config = restored(TrainConfig, stored, folder / "run.json")
         clock = Clock()
         started = time.perf_counter()

@@ -30,7 +30,6 @@ from graings.training.guard import Gradient, Guard, first_not_finite
 from graings.training.initialize import make_scene
 from graings.training.optimizer import Optimizer
 from graings.training.regularisers import regularisers
-from graings.training.silhouette import Silhouette
 from graings.training.snapshots import Snapshots
 from graings.training.streams import Streams, ViewSampler
 from graings.training.time_window import TimeWindow
@@ -91,7 +90,6 @@ class Trainer:
         self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
         self.times = capture.times
         self.iteration = 0
-        self.silhouette = Silhouette.of(capture, images, config)
         start = make_scene(capture, images, config, self.streams)
         self.scene = start.scene
         self.window = TimeWindow(config, [frame.time for frame in capture.train], start.time_window)
@@ -132,8 +130,6 @@ class Trainer:
         result = draw(composition, frame.camera, self.background, means2d_offset=offset)
         image_loss = photometric(result.color, target, self.config.loss.ssim)
         loss = image_loss + self.regularisers(composition, frame.time)
-        if self.silhouette is not None:
-            loss = loss + self.silhouette.loss(result.alpha, frame)
         # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.
         if loss.requires_grad:
             loss.backward()
@@ -180,15 +176,10 @@ class Trainer:
 
     def _opening(self) -> list[str]:
         """At the first step, what was decided before it; in words."""
-        if self.iteration > 1:
+        share = self.window.share(1)
+        if self.iteration > 1 or share == 1:
             return []
-        events, share = [], self.window.share(1)
-        if share < 1:
-            events.append(f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens")
-        if self.silhouette is not None:
-            hidden = 100 * self.silhouette.share
-            events.append(f"silhouette: {hidden:.2g} % of what the masks show has the background's colour")
-        return events
+        return [f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens"]
 
     def _next_frame(self) -> Frame:
         """The next view that takes part by now."""
