@@ -92,17 +92,18 @@ def main() -> None:
     parser.add_argument("--view", type=int, default=0)
     options = parser.parse_args()
 
-    options.output.mkdir(parents=True, exist_ok=True)
-    torch.set_grad_enabled(False)
-    document = {}
     if len({run.name for run in options.runs}) < len(options.runs):
         parser.error("two of the runs have the same folder name, which names their row and picture: rename one")
-    for run in options.runs:
-        model = load_model(run)
+    models = {run: load_model(run) for run in options.runs}
+    for run, model in models.items():
         if options.view not in range(len(model.views["val"])):
             parser.error(
                 f"{run}: has no validation view {options.view}: give another --view, or a capture with a val split"
             )
+    options.output.mkdir(parents=True, exist_ok=True)
+    torch.set_grad_enabled(False)
+    document = {}
+    for run, model in models.items():
         colors, alphas = clip(model, options.view, options.frames)
         document[run.name] = {**flicker(colors, alphas), **error_in_time(run, model)}
         chosen = colors[np.linspace(0, len(colors) - 1, SHOWN[0] * SHOWN[1]).round().astype(int)]
