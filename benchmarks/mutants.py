@@ -67,7 +67,7 @@ class Mutant:
         return self.file.startswith(SOURCE)
 
 
-GEOMETRY, FRAME = f"{SOURCE}/geometry.hpp", f"{SOURCE}/frame.cpp"
+GEOMETRY, BINNING = f"{SOURCE}/geometry.hpp", f"{SOURCE}/binning.cpp"
 TILES, TILE_GRADIENT = f"{SOURCE}/tiles.hpp", f"{SOURCE}/tile_gradient.hpp"
 SCENE = ("tests/scene",)
 
@@ -131,9 +131,9 @@ MUTANTS = (
     Mutant(
         "h",
         "ties of depth decided by the row",
-        FRAME,
-        "std::tuple(depths[a.id], uids[a.id], a.id) < std::tuple(depths[b.id], uids[b.id], b.id)",
-        "std::tuple(depths[a.id], uids[0], a.id) < std::tuple(depths[b.id], uids[0], b.id)",
+        BINNING,
+        "std::tuple(depths_[a.id], uids_[a.id], a.id) < std::tuple(depths_[b.id], uids_[b.id], b.id)",
+        "std::tuple(depths_[a.id], uids_[0], a.id) < std::tuple(depths_[b.id], uids_[0], b.id)",
     ),
     Mutant(
         "i",
@@ -154,23 +154,25 @@ MUTANTS = (
         "k",
         "gradient counts entries behind the stop",
         TILE_GRADIENT,
-        "(p16(limits.alpha_min) <= raw) & (p16(R(j)) <= load<kLanes>(last[b]))",
-        "p16(limits.alpha_min) <= raw",
+        "(p16(limits.alpha_min) <= seen.raw) & (p16(R(j)) <= load<kLanes>(last[b]))",
+        "p16(limits.alpha_min) <= seen.raw",
     ),
     Mutant(
         "l",
         "sums taken for written behind the last entry seen",
         TILE_GRADIENT,
-        "for (int64_t k = begin + n; k < end; k++) all.written[all.slots[k]] = 0;",
+        "for (int64_t k = begin + n; k < end; k++) all.written[args.pairs[k].place] = 0;",
         "",
     ),
-    Mutant("m", "sign of the sum of s flipped", TILE_GRADIENT, "es = es + ge_s", "es = es - ge_s"),
+    Mutant(
+        "m", "sign of the sum of s flipped", TILE_GRADIENT, "total.es = total.es + ge_s", "total.es = total.es - ge_s"
+    ),
     Mutant(
         "n",
-        "rectangle of tiles one too narrow on the right",
+        "rectangle of blocks one too narrow on the right",
         GEOMETRY,
-        "store(box[1], tile(last_x))",
-        "store(box[1], tile(last_x) - one)",
+        "store(box[1], block(last_x))",
+        "store(box[1], block(last_x) - one)",
     ),
     Mutant(
         "o",
@@ -182,16 +184,16 @@ MUTANTS = (
     Mutant(
         "p",
         "equal keys of depth taken for equal depths and uids",
-        FRAME,
+        BINNING,
         "if (a.key != b.key) return a.key < b.key;",
         "return a.key < b.key;",
     ),
     Mutant(
         "depth-rounded",
         "uids decide between depths of equal keys",
-        FRAME,
-        "std::tuple(depths[a.id], uids[a.id], a.id) < std::tuple(depths[b.id], uids[b.id], b.id)",
-        "std::tuple(uids[a.id], a.id) < std::tuple(uids[b.id], b.id)",
+        BINNING,
+        "std::tuple(depths_[a.id], uids_[a.id], a.id) < std::tuple(depths_[b.id], uids_[b.id], b.id)",
+        "std::tuple(uids_[a.id], a.id) < std::tuple(uids_[b.id], b.id)",
     ),
     Mutant(
         "low-missing",
@@ -210,14 +212,14 @@ MUTANTS = (
     Mutant(
         "row-narrow",
         "rows of tiles end one tile early on the right",
-        FRAME,
-        "last = std::min(uint32_t(to) / kTile, span.right);",
-        "last = std::min((uint32_t(to) - 1) / kTile, span.right);",
+        BINNING,
+        "last = std::min(uint32_t(to) / kTile, span.last_column());",
+        "last = std::min((uint32_t(to) - 1) / kTile, span.last_column());",
     ),
     Mutant(
         "tilt-missing",
         "rows of tiles end as if there were no tilt",
-        FRAME,
+        BINNING,
         "std::clamp(side * turn, low, high)",
         "std::clamp(0.0, low, high)",
     ),
@@ -232,7 +234,7 @@ MUTANTS = (
         "cap-passed",
         "gradient passed through the cap of alpha",
         TILE_GRADIENT,
-        "select(raw <= p16(limits.alpha_max), weight * gain, zero)",
+        "select(seen.raw <= p16(limits.alpha_max), weight * gain, zero)",
         "weight * gain",
     ),
     Mutant(
@@ -248,6 +250,41 @@ MUTANTS = (
         TILE_GRADIENT,
         "ground = fma(g, p16(args.background[c]), ground);",
         "ground = fma(g, p16(R(0)), ground);",
+    ),
+    Mutant(
+        "columns-narrow",
+        "blocks of a tile end one column early on the right",
+        BINNING,
+        "kColumnsTo[] = {0x1111, 0x3333,",
+        "kColumnsTo[] = {0x1111, 0x1111,",
+    ),
+    Mutant(
+        "bits-missing",
+        "what agrees in the leading bits of its key left as it came",
+        BINNING,
+        "if (!before(to[i], to[i - 1])) continue;",
+        "if (before(to[i], to[i]) || count > kFew) continue;",
+    ),
+    Mutant(
+        "moves-lost",
+        "sort broken off where it moves too much",
+        BINNING,
+        "std::sort(to, to + count, before);",
+        "",
+    ),
+    Mutant(
+        "dead-block",
+        "entries forgotten in all blocks where one block has stopped",
+        TILES,
+        "args.pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);",
+        "args.pairs[k + __builtin_ctzll(list)].mask = 0;",
+    ),
+    Mutant(
+        "not-closed",
+        "sums of an entry left open when the next one begins",
+        TILE_GRADIENT,
+        "        if (open >= 0) close();\n        open = j",
+        "        open = j",
     ),
     Mutant(
         "group-split",

@@ -6,8 +6,8 @@
 DIR holds `bench_scene.py` with `make_scene(n)`, `camera(size, dist=...)` and `target_image(height, width)`, and
 optionally `limit_kernel.py` with a class `LimitKernel(scene, camera)` that has `forward()` and `fwd_bwd(target)`: the
 yardstick, built when first used. Further scenes: splat files and run folders of trained models. Ours goes through the
-PyTorch function with its argument checks and gives colour, alpha and depth; both take the sign of the difference to
-the target as upstream.
+PyTorch function with its argument checks and gives colour and alpha, and depth where a row says so; both take the sign
+of the difference to the target as upstream.
 
 The two are timed in turn, so that a busy neighbour hits both: a pause, a call to warm up, three that count. The
 yardstick runs in a process of its own, because both would otherwise share the threads of one OpenMP library, which
@@ -61,8 +61,8 @@ class Ours:
         self.draw = draw
         self.image = self.result().color.detach()
 
-    def result(self) -> RenderResult:
-        return self.draw(self.gaussians, self.camera, self.background)
+    def result(self, *, depth: bool = False) -> RenderResult:
+        return self.draw(self.gaussians, self.camera, self.background, depth=depth)
 
     def forward(self) -> None:
         with torch.no_grad():
@@ -73,7 +73,7 @@ class Ours:
         torch.autograd.grad(color, list(self.leaves.values()), self.upstream(color))
 
     def forward_backward_depth(self) -> None:
-        result = self.result()
+        result = self.result(depth=True)
         upstream = self.upstream(result.color)
         extra = upstream[..., 0].contiguous()
         torch.autograd.grad(

@@ -7,7 +7,7 @@ All lengths are in normalised units (`graings.units`). Knows nothing of images, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +33,7 @@ class Camera:
     cy: float
     width: int
     height: int
+    center: Vector = field(init=False, repr=False)  # position of the camera in the world, [3]
 
     def __post_init__(self) -> None:
         pose = np.array(self.world_to_camera, dtype=np.float64)
@@ -55,12 +56,7 @@ class Camera:
             pose[:3, :3] = left @ right
         pose.flags.writeable = False
         object.__setattr__(self, "world_to_camera", pose)
-
-    @property
-    def center(self) -> Vector:
-        """Position of the camera in the world, [3]."""
-        pose = self.world_to_camera
-        return -pose[:3, :3].T @ pose[:3, 3]
+        object.__setattr__(self, "center", -pose[:3, :3].T @ pose[:3, 3])
 
     @property
     def forward(self) -> Vector:

@@ -39,7 +39,7 @@ def draw(
     means2d_offset: Float[Tensor, "gaussian 2"] | None = None,
     settings: RasterSettings | None = None,
 ) -> RenderResult:
-    """Rasterize a composition; gradients flow to it and to `means2d_offset` (pixels, see `rasterize`)."""
+    """Rasterize a composition, without depth; gradients flow to it and to `means2d_offset` (pixels)."""
     gaussians = composition.gaussians
     return rasterize(
         gaussians,
@@ -47,4 +47,5 @@ def draw(
         torch.tensor(list(background), dtype=gaussians.means.dtype),
         means2d_offset=means2d_offset,
         settings=settings or RasterSettings(),
+        depth=False,
     )

@@ -21,9 +21,9 @@ def check_arguments(
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
     for name in ("means", "quats", "log_scales", "opacities", "colors", "uids"):
-        device = getattr(gaussians, name).device
-        if device.type != "cpu":
-            raise ValueError(f"{name} must be on the CPU, got {device}")
+        tensor = getattr(gaussians, name)
+        if not tensor.is_cpu:
+            raise ValueError(f"{name} must be on the CPU, got {tensor.device}")
 
 
 def _check(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: object) -> None:
@@ -31,5 +31,5 @@ def _check(name: str, tensor: Tensor, shape: tuple[int, ...], dtype: object) -> 
         raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
     if tensor.dtype != dtype:
         raise ValueError(f"{name} must be {dtype} like the Gaussians, got {tensor.dtype}")
-    if tensor.device.type != "cpu":
+    if not tensor.is_cpu:
         raise ValueError(f"{name} must be on the CPU, got {tensor.device}")

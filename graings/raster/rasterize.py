@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -28,14 +27,16 @@ def rasterize(
     *,
     means2d_offset: Tensor | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
+    depth: bool = True,
     threads: int | None = None,
 ) -> RenderResult:
     """Draw `gaussians` seen by `camera` on `background` [3] (RGB, same dtype); Eq. (1) and (2).
 
     `means2d_offset` [N, 2] is added to the projected centres (pixels): pass zeros that require a gradient to
     learn the gradient in screen space. A Gaussian that is not drawn receives a gradient of exactly zero.
-    `threads` is the number of CPU threads (None: the kernel's default); the result has the same bits for any number.
-    Pixels are computed in the dtype of the Gaussians, geometry always in float64.
+    Without `depth` the result has None there. `threads` is the number of CPU threads (None: the kernel's default); the
+    result has the same bits for any number. Pixels are computed in the dtype of the Gaussians, geometry always
+    in float64.
 
     Raises `ValueError` for a wrong shape, dtype or device, `KernelError` when the kernel is not built.
     """
@@ -51,13 +52,13 @@ def rasterize(
     )
     workers = kernel.threads() if threads is None else threads
     if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors):
-        return RenderResult(*_Rasterize.apply(*tensors, gaussians.uids, camera, settings, workers))  # type: ignore[no-untyped-call]
+        return RenderResult(*_Rasterize.apply(*tensors, gaussians.uids, camera, settings, depth, workers))  # type: ignore[no-untyped-call]
     inputs = [_prepared(tensor) for tensor in (*tensors, gaussians.uids)]
-    frame, images = _draw(inputs, camera, settings, workers, gradient=False)
+    frame, images = _draw(inputs, camera, settings, depth, workers, gradient=False)
     return RenderResult(*images, frame.culled)
 
 
-Images = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]  # of a `RenderResult`, in its order
+Images = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]  # of a `RenderResult`, in its order
 
 
 def _prepared(tensor: Tensor | None) -> Tensor | None:
@@ -65,13 +66,19 @@ def _prepared(tensor: Tensor | None) -> Tensor | None:
     return None if tensor is None else tensor.detach().contiguous()
 
 
-def _arrays(*tensors: Tensor | None) -> list[Any]:
-    """Views for the kernel, which takes NumPy's arrays several times faster than tensors."""
-    return [None if tensor is None else tensor.numpy() for tensor in tensors]
+def _addresses(*tensors: Tensor | None) -> list[int]:
+    """Where the numbers of prepared tensors lie, for the kernel; 0: nowhere."""
+    return [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
 def _draw(
-    inputs: Sequence[Tensor | None], camera: Camera, settings: RasterSettings, threads: int, *, gradient: bool
+    inputs: Sequence[Tensor | None],
+    camera: Camera,
+    settings: RasterSettings,
+    depth: bool,
+    threads: int,
+    *,
+    gradient: bool,
 ) -> tuple[Any, Images]:
     """The kernel's frame, which keeps what a `gradient` needs, and the images.
 
@@ -80,15 +87,20 @@ def _draw(
     means = inputs[0]
     assert means is not None
     n, height, width = len(means), camera.height, camera.width
-    color = means.new_empty(height, width, 3)
-    alpha, depth = means.new_empty(height, width), means.new_empty(height, width)
-    means2d, radii = means.new_empty(n, 2), means.new_empty(n, 2)
-    images = (color, alpha, depth, means2d, radii)
+    flat = means.new_empty(height, width) if depth else None
+    images = (
+        means.new_empty(height, width, 3),
+        means.new_empty(height, width),
+        flat,
+        means.new_empty(n, 2),
+        means.new_empty(n, 2),
+    )
     module = kernel.kernel()
     draw = module.draw_float if means.dtype == torch.float32 else module.draw_double
     frame = draw(
-        *_arrays(*inputs),
-        np.ascontiguousarray(camera.world_to_camera[:3, :3]),
+        n,
+        *_addresses(*inputs),
+        camera.world_to_camera,
         camera.center,
         camera.fx,
         camera.fy,
@@ -104,7 +116,7 @@ def _draw(
         settings.far,
         settings.frustum_margin,
         settings.compat,
-        *_arrays(*images),
+        *_addresses(*images),
         threads,
         gradient,
     )
@@ -113,10 +125,10 @@ def _draw(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, dict[str, int]]:
-        *tensors, camera, settings, threads = arguments
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor, dict[str, int]]:
+        *tensors, camera, settings, depth, threads = arguments
         inputs = [_prepared(tensor) for tensor in tensors]
-        frame, images = _draw(inputs, camera, settings, threads, gradient=True)
+        frame, images = _draw(inputs, camera, settings, depth, threads, gradient=True)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*images[3:])
         ctx.save_for_backward(*inputs[:7])
@@ -128,22 +140,19 @@ class _Rasterize(torch.autograd.Function):
     def backward(
         ctx: Any, v_color: Tensor | None, v_alpha: Tensor | None, v_depth: Tensor | None, *_: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        nothing: tuple[None, ...] = (None,) * 11
+        nothing: tuple[None, ...] = (None,) * 12
         if v_color is None and v_alpha is None and v_depth is None:
             return nothing
         means, quats, log_scales, opacities, colors, ground, shift = ctx.saved_tensors
-        height, width = ctx.size
-        upstream = means.new_zeros(height, width, 3) if v_color is None else v_color
+        upstream = means.new_zeros(*ctx.size, 3) if v_color is None else v_color
         inputs = (means, quats, log_scales, opacities, colors)
         gradients: list[Tensor | None] = [torch.empty_like(t) for t in inputs]
         gradients.append(torch.empty_like(ground) if ctx.needs_input_grad[len(inputs)] else None)
         v_shift = None if shift is None else torch.empty_like(shift)
         upstreams = [_prepared(v) for v in (upstream, v_alpha, v_depth)]
         ctx.frame.gradient(
-            *_arrays(*inputs, ground, shift),
-            height,
-            width,
-            *_arrays(*upstreams, *gradients, v_shift),
+            len(means),
+            *_addresses(*inputs, ground, shift, *upstreams, *gradients, v_shift),
             ctx.threads,
         )
-        return (*gradients, v_shift, None, None, None, None)
+        return (*gradients, v_shift, None, None, None, None, None)

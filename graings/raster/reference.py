@@ -51,6 +51,7 @@ def rasterize(
     *,
     means2d_offset: Tensor | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
+    depth: bool = True,
     threads: int | None = None,
 ) -> RenderResult:
     """Draw `gaussians` seen by `camera` on `background` [3]; same contract as `graings.raster.rasterize`.
@@ -86,7 +87,8 @@ def rasterize(
     with torch.no_grad():
         means2d = torch.zeros(n, 2, dtype=torch.float64).index_copy(0, drawn, prints.means2d)
         radii = torch.zeros(n, 2, dtype=torch.float64).index_copy(0, drawn, _radii(prints, opacities[drawn], settings))
-    return RenderResult(image[..., :3], image[..., 3], image[..., 4], means2d.to(dtype), radii.to(dtype), culled)
+    drawn_depth = image[..., 4] if depth else None
+    return RenderResult(image[..., :3], image[..., 3], drawn_depth, means2d.to(dtype), radii.to(dtype), culled)
 
 
 def _cull(

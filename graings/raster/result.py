@@ -53,13 +53,13 @@ class RenderResult:
     """One rendered view; images are [height, width, ...] in the dtype of the Gaussians.
 
     `depth` is the blended sum of w_i Z_i (normalised units, 0 where nothing is drawn; divide by `alpha` for
-    the expected depth). `means2d` [N, 2] in pixels and `radii` [N, 2] (half-widths of the footprint in
-    pixels, 0 = not drawn) carry no gradient.
+    the expected depth), None where it was not asked for. `means2d` [N, 2] in pixels and `radii` [N, 2] (half-widths of
+    the footprint in pixels, 0 = not drawn) carry no gradient.
     """
 
     color: Float[Tensor, "height width 3"]
     alpha: Float[Tensor, "height width"]
-    depth: Float[Tensor, "height width"]
+    depth: Float[Tensor, "height width"] | None
     means2d: Float[Tensor, "gaussian 2"]
     radii: Float[Tensor, "gaussian 2"]
     culled: dict[str, int]  # why Gaussians were not drawn: non_finite, zero_quat, behind, faint, outside

@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from graings.gaussians import Gaussians
+from graings.raster import reference
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
 from tests.raster.comparison import draw, upstream
@@ -22,6 +24,59 @@ def test_the_least_difference_of_depth_decides_before_uids() -> None:
     batch = replace(batch, means=means, uids=torch.arange(3))
     color = rasterize(batch, pinhole(15, 15), torch.zeros(3, dtype=torch.float64), threads=1).color[7, 7]
     assert (color - batch.colors[1]).norm() < (color - batch.colors[0]).norm()
+
+
+def crowds() -> dict[str, Tensor]:
+    """Depths of 500 Gaussians, from far apart to too close for a key of 32 bits."""
+    even = torch.rand(500, generator=torch.Generator().manual_seed(73), dtype=torch.float64)
+    far = torch.tensor([1e6], dtype=torch.float64)
+    return {
+        "even": 2 + even,
+        "descending": 3 - even.sort().values,
+        "two clusters": torch.where(even < 0.5, 2 + 1e-3 * even, 900 + even),
+        "one far away": torch.cat([2 + 1e-3 * even[1:], far]),
+        "one far away, the rest descending": torch.cat([far, 2.001 - 1e-3 * even[1:].sort().values]),
+        "keys agree": torch.cat([2 + 1e-9 * even[1:], far]),
+        "keys agree, descending": torch.cat([far, 2 + 1e-9 - 1e-9 * even[1:].sort().values]),
+        "all equal": torch.full_like(even, 2.0),
+    }
+
+
+@pytest.mark.parametrize("crowd", crowds())
+def test_depths_are_in_order_however_they_crowd(crowd: str, isa: str) -> None:
+    """The sort looks at leading bits first, and some depths agree in them."""
+    depths, camera = crowds()[crowd], pinhole(40, 20)
+    batch = gaussians(len(depths), 74, spread=0.4, log_scales=(-1.5, -0.5), opacity=(0.01, 0.03))
+    aside = batch.means[:, :2] / batch.means[:, 2:] * depths[:, None]
+    scales = batch.log_scales + (depths / 2).log()[:, None]  # of one size in the picture
+    batch = replace(batch, means=torch.cat([aside, depths[:, None]], 1), log_scales=scales)
+    background = torch.zeros(3, dtype=torch.float64)
+    ours = rasterize(batch, camera, background, threads=2)
+    oracle = reference.rasterize(batch, camera, background)
+    assert ours.color.amax() > 0.3
+    torch.testing.assert_close(ours.color, oracle.color, rtol=0, atol=1e-12)
+
+
+def test_without_depth_the_rest_keeps_its_bits(isa: str) -> None:
+    batch, camera = gaussians(300, 75, log_scales=(-3.0, -1.0)), pinhole(50, 40)
+    for dtype in (torch.float32, torch.float64):
+        pictures = []
+        for depth in (True, False):
+            leaf = batch.means.to(dtype).requires_grad_()
+            result = rasterize(
+                replace(cast(batch, dtype), means=leaf), camera, torch.ones(3, dtype=dtype), depth=depth, threads=2
+            )
+            (result.color.square().sum() + result.alpha.square().sum()).backward()
+            pictures.append((result.color, result.alpha, result.means2d, result.radii, leaf.grad))
+            assert (result.depth is not None) == depth
+        assert all(torch.equal(first, second) for first, second in zip(*pictures, strict=True))
+
+
+def test_an_image_too_long_for_16_bits_of_blocks_is_refused() -> None:
+    batch, background = gaussians(3, 76), torch.zeros(3, dtype=torch.float64)
+    for width, height in ((1, 262145), (262145, 1)):
+        with pytest.raises(ValueError, match="at most 262144 pixels"):
+            rasterize(batch, pinhole(width, height), background)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -1,6 +1,7 @@
 // One drawn view: runs the stages of the forward pass and keeps what the gradient needs.
 #pragma once
 #include <vector>
+#include "binning.hpp"
 #include "buffer.hpp"
 #include "types.hpp"
 
@@ -8,7 +9,7 @@ namespace graings {
 
 template <class R>
 struct Outputs {
-    R *color, *alpha, *depth, *means2d, *radii;
+    R *color, *alpha, *depth, *means2d, *radii;  // depth may be null
 };
 
 template <class R>
@@ -16,18 +17,7 @@ struct Gradients {
     R *means, *quats, *log_scales, *opacities, *colors, *background, *offset;  // the last two may be null
 };
 
-struct DepthKey {
-    uint32_t key, id;
-};
-
-// What is known of a run of Gaussians once they are projected.
-struct Piece {
-    int64_t begin = 0, end = 0, tiled = 0, pairs = 0;  // tiled: those that touch a tile
-    uint64_t least = ~uint64_t(0), most = 0;           // of their depths, as bits
-    int64_t statuses[kStatuses] = {};
-};
-
-enum Stage { kProject, kSort, kBin, kBlend, kBlendGradient, kGeometryGradient, kStages };
+enum Stage { kProject, kBin, kSort, kBlend, kBlendGradient, kGeometryGradient, kStages };
 
 template <class R>
 class Frame {
@@ -39,27 +29,24 @@ public:
     void gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha, const R* v_depth, const Gradients<R>& out, int threads) const;
 
     const int64_t* statuses() const { return statuses_; }
-    int64_t pairs() const { return pairs_; }
+    int64_t pairs() const { return pair_count_; }
     int64_t evaluated() const;  // pairs of pixel and Gaussian
     const double* seconds() const { return seconds_; }  // per Stage
 
 private:
-    std::vector<Piece> project(const ProjectArgs<R>&, int threads);
-    Buffer<DepthKey> sorted(const std::vector<Piece>&, const double* depths, const int64_t* uids, int threads);
-    void bin(const Buffer<DepthKey>& order, int threads);
+    std::vector<Piece> project(const ProjectArgs<R>&, Binning<R>&, int threads);
     TileArgs<R> tile_args(const R* background) const;
 
     Camera camera_;
     Settings settings_;
-    int64_t count_, tiles_, pairs_ = 0, tiled_ = 0;
+    int64_t count_, tiles_, pair_count_ = 0;
     int64_t statuses_[kStatuses] = {};
     mutable double seconds_[kStages] = {};
     Buffer<uint8_t> status_;
     Buffer<Record<R>> records_;
     Buffer<Span> spans_;
     Buffer<int64_t> begin_;
-    Buffer<uint32_t> ids_, slots_;
-    Buffer<uint16_t> masks_;
+    Buffer<Pair> pairs_;
     Buffer<int32_t> processed_, items_;
     Buffer<R> light_, last_;
 };

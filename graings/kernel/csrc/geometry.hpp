@@ -118,14 +118,14 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         const D widened = min(fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30));
         const D flat = radius * tall, fall = d8(2 * kLn2) * p.c * p.v / p.a;
         const D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
-        // tiles with a pixel's centre in it
-        const auto tile = [](D pixel) { return floor(pixel * d8(1.0 / kTile)); };
+        // blocks with a pixel's centre in it
+        const auto block = [](D pixel) { return floor(pixel * d8(1.0 / kBlock)); };
         const D first_x = zero - floor(zero - clamp(p.x - wide - half, zero, w)), last_x = floor(clamp(p.x + wide - half, zero - one, w - one));
         const D first_y = zero - floor(zero - clamp(p.y - high - half, zero, h)), last_y = floor(clamp(p.y + high - half, zero - one, h - one));
         const D exact = (s.alpha_min > 0 ? root : d8(__builtin_inf())) * radius;
         D radii[2] = {exact * broad, exact * tall};
         double box[4][kGroup];
-        store(box[0], tile(first_x)), store(box[1], tile(last_x)), store(box[2], tile(first_y)), store(box[3], tile(last_y));
+        store(box[0], block(first_x)), store(box[1], block(last_x)), store(box[2], block(first_y)), store(box[3], block(last_y));
         auto tiled = (first_x <= last_x) & (first_y <= last_y), inside = zero <= zero;
         if (s.compat) {
             double x[kGroup], y[kGroup], a[kGroup], c[kGroup], slope[kGroup], square[kGroup], hit[kGroup];
@@ -138,6 +138,7 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
                 box[0][i] = bound(__builtin_floor((x[i] - square[i]) / kTile), across), box[1][i] = bound(__builtin_ceil((x[i] + square[i]) / kTile), across) - 1;
                 box[2][i] = bound(__builtin_floor((y[i] - square[i]) / kTile), down), box[3][i] = bound(__builtin_ceil((y[i] + square[i]) / kTile), down) - 1;
                 hit[i] = square[i] > 0 && box[0][i] <= box[1][i] && box[2][i] <= box[3][i];
+                for (int side = 0; side < 4; side++) box[side][i] = Span::kPerTile * box[side][i] + side % 2 * (Span::kPerTile - 1);  // whole tiles
             }
             radii[0] = radii[1] = load<kGroup>(square);
             tiled = inside = zero < load<kGroup>(hit);
@@ -161,10 +162,11 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
             const auto is = [&](uint32_t which) { return which >> lane & 1; };
             args.status[group + lane] = is(is_drawn) ? kDrawn : !is(is_finite) ? kNonFinite : !is(is_turned) ? kZeroQuat : !is(is_ahead) ? kBehind
                                         : !is(is_seen) ? kFaint : !is(is_bounded) ? kNonFinite : kOutside;
-            Span span{0, 0, 1, 0, 1, 0};
+            Span span{};
             if (is(is_tiled)) {
-                const uint32_t l = uint32_t(int32_t(box[0][lane])), r = uint32_t(int32_t(box[1][lane])), t = uint32_t(int32_t(box[2][lane])), b = uint32_t(int32_t(box[3][lane]));
-                span = {0, (r - l + 1) * (b - t + 1), l, r, t, b};
+                const auto side = [&](int which) { return uint16_t(int32_t(box[which][lane])); };
+                span = {0, 0, side(0), side(1), side(2), side(3)};
+                span.count = span.tiles();
             }
             args.spans[group + lane] = span;
         }
@@ -180,22 +182,22 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
     const Inputs<R>& in = args.in;
     for (int64_t group = begin; group < end; group += kGroup) {
         double sums[kGroup][kSums], on_[kGroup] = {};
-        R sr_[kGroup], sy_[kGroup], opacity_[kGroup];
+        R opacity_[kGroup];
         bool drawn = false;
         for (int lane = 0; lane < kGroup; lane++) {
             const int64_t i = group + lane;
-            sr_[lane] = sy_[lane] = opacity_[lane] = 1;
+            opacity_[lane] = 1;
             if (i >= end || args.status[i] != kDrawn) {
                 std::memset(sums[lane], 0, sizeof sums[lane]);
                 continue;
             }
             drawn = true, on_[lane] = 1;
-            sr_[lane] = args.records[i].look.sr, sy_[lane] = args.records[i].look.sy, opacity_[lane] = in.opacities[i];
-            const R* slot = args.sums + int64_t(args.spans[i].begin) * kSums;
+            opacity_[lane] = in.opacities[i];
+            const R* of_pair = args.sums + int64_t(args.spans[i].begin) * kSumStride;
             double total[kSums] = {};
-            for (uint32_t pair = 0; pair < args.spans[i].count; pair++, slot += kSums)
+            for (uint32_t pair = 0; pair < args.spans[i].count; pair++, of_pair += kSumStride)
                 if (args.written[args.spans[i].begin + pair])
-                    for (int q = 0; q < kSums; q++) total[q] += double(slot[q]);
+                    for (int q = 0; q < kSums; q++) total[q] += double(of_pair[q]);
             std::memcpy(sums[lane], total, sizeof total);
         }
         const D none[4] = {d8(0), d8(0), d8(0), d8(0)};
@@ -212,7 +214,7 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         const Projected p = project_group(k, args.settings, in, group);
         D total[kSums];
         columns_of<kSums>(sums[0], 0, kGroup, total);
-        const D ln2 = d8(kLn2), inverse_v = d8(1) / p.v, inverse_sr = d8(1) / load_as<kGroup>(sr_), inverse_sy = d8(1) / load_as<kGroup>(sy_);
+        const D ln2 = d8(kLn2), inverse_v = d8(1) / p.v, inverse_sr = d8(1 / kRootHalfLog2E) * sqrt(p.v), inverse_sy = d8(1 / kRootHalfLog2E) * sqrt(p.c);
         const D across = inverse_sr * inverse_v, g_x = total[kR] * across;
         const D g_y = total[kS] * inverse_sy * p.inverse_c - p.slope * g_x;
         const D g_slope = total[kRS] * inverse_sy * across;

@@ -108,6 +108,15 @@ GRAINGS_INLINE Native<double> root(Native<double> a) {
 #endif
 #endif
 
+// ---- one number
+GRAINGS_INLINE double fused(double a, double b, double c) {
+#if defined(__FMA__) || defined(__aarch64__)
+    return __builtin_fma(a, b, c);
+#else
+    return a * b + c;
+#endif
+}
+
 // ---- N numbers: one register, or two halves
 template <class T, int N, bool One = (N == kNative<T>)> struct Vec;
 template <class T, int N, bool One = (N == kNative<T>)> struct Mask;
@@ -206,19 +215,6 @@ template <int N, class R> GRAINGS_INLINE Vec<double, N> load_as(const R* p) {
         return {__builtin_convertvector(narrow, Native<double>)};
     } else return {load_as<N / 2>(p), load_as<N / 2>(p + N / 2)};
 }
-// Rounded to R.
-template <class R> GRAINGS_INLINE Vec<R, 16> rounded(Vec<double, 16> a) {
-    if constexpr (sizeof(R) == sizeof(double)) return a;
-#if defined(__AVX512DQ__)
-    else return {(Native<R>)_mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps((__m512d)a.lo.v)), _mm512_cvtpd_ps((__m512d)a.hi.v), 1)};
-#else
-    else {
-        R numbers[16];
-        store_as<R>(numbers, a);
-        return load<16>(numbers);
-    }
-#endif
-}
 GRAINGS_VEC T sum(Vec<T, N> a) {
     if constexpr (kOne<T, N>) return total(a.v);
     else return sum(a.lo + a.hi);
@@ -257,9 +253,9 @@ template <int N> GRAINGS_INLINE Vec<double, N> power_of_two_part(Vec<double, N> 
 GRAINGS_VEC Vec<T, N> exp2_minus(Vec<T, N> x) {
 #if defined(__AVX512F__)
     if constexpr (sizeof(T) == 4 && kOne<T, N>) {
-        const __m512 whole = _mm512_roundscale_ps((__m512)x.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-        const Vec<T, N> f{(Native<T>)_mm512_sub_ps(whole, (__m512)x.v)};
-        return {(Native<T>)_mm512_scalef_ps((__m512)power_of_two_part(f).v, _mm512_sub_ps(_mm512_setzero_ps(), whole))};
+        const __m512 minus = _mm512_xor_ps((__m512)x.v, _mm512_set1_ps(-0.0f)), whole = _mm512_roundscale_ps(minus, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+        const Vec<T, N> f{(Native<T>)_mm512_sub_ps(minus, whole)};
+        return {(Native<T>)_mm512_scalef_ps((__m512)power_of_two_part(f).v, whole)};
     }
 #endif
     constexpr T magic = sizeof(T) == 4 ? T(12582912) : T(6755399441055744);

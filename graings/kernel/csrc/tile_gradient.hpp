@@ -23,7 +23,7 @@ GRAINGS_INLINE void add_lanes(const P<R> (&v)[kSums], R* out) {
         const __m512 last = pairs(pairs(quarter[0], quarter[1]), pairs(quarter[2], quarter[2]));
         // quad q: vector q of quarters 0, 1, 2, 2
         const __m512i in_order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-        _mm512_mask_storeu_ps(out, (1 << kSums) - 1, _mm512_permutexvar_ps(in_order, last));
+        _mm512_store_ps(out, _mm512_permutexvar_ps(in_order, last));
         return;
     }
 #endif
@@ -81,7 +81,7 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         for (int c = 0; c < kChannels; c++) heard |= uint32_t(any_set(up[c][b])) << b;
 
     const int n = heard ? args.processed[tile] : 0;
-    for (int64_t k = begin + n; k < end; k++) all.written[all.slots[k]] = 0;
+    for (int64_t k = begin + n; k < end; k++) all.written[args.pairs[k].place] = 0;
     if (!heard) return;
 
     // what a pixel sees behind the current entry, weighed by its upstream: starts at the background
@@ -99,46 +99,77 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         store(behind[b], ground);
     }
 
+    struct Seen {  // of a block of an entry
+        P<R> raw;  // alpha before its cap
+        Distance<R> at;
+        int block;
+    };
+    const auto look = [&](const TileEntry<R>& entry, uint32_t mask) {
+        const int b = __builtin_ctz(mask);
+        const Distance<R> at = distance(entry, b, rows);
+        return Seen{uncapped_alpha(entry, at), at, b};
+    };
+    struct Totals {
+        P<R> e, er, es, err, ers, ess, red, green, blue, depth;
+    };
+    const auto add = [&](Totals& total, const TileEntry<R>& entry, int j, const Seen& seen) {
+        const int b = seen.block;
+        const auto counts = (p16(limits.alpha_min) <= seen.raw) & (p16(R(j)) <= load<kLanes>(last[b]));
+        const P<R> alpha = select(counts, min(seen.raw, p16(limits.alpha_max)), zero);
+        const P<R> before = load<kLanes>(light[b]) / (p16(R(1)) - alpha), weight = alpha * before;
+        store(light[b], before);
+        const P<R> g0 = load<kLanes>(up[0][b]), g1 = load<kLanes>(up[1][b]), g2 = load<kLanes>(up[2][b]);
+        P<R> own = fma(g0, p16(entry.look.red), fma(g1, p16(entry.look.green), g2 * p16(entry.look.blue)));
+        if constexpr (Extra) {
+            const P<R> g4 = load<kLanes>(up[4][b]);
+            own = fma(g4, p16(entry.look.depth), own + load<kLanes>(up[3][b]));
+            total.depth = fma(weight, g4, total.depth);
+        }
+        const P<R> back = load<kLanes>(behind[b]), gain = own - back;
+        store(behind[b], fma(alpha, gain, back));
+        const P<R> ge = select(seen.raw <= p16(limits.alpha_max), weight * gain, zero);  // capped alpha passes none
+        const P<R> ge_r = ge * seen.at.r, ge_s = ge * seen.at.s;
+        total.e = total.e + ge, total.er = total.er + ge_r, total.es = total.es + ge_s;
+        total.err = fma(ge_r, seen.at.r, total.err), total.ers = fma(ge_r, seen.at.s, total.ers), total.ess = fma(ge_s, seen.at.s, total.ess);
+        total.red = fma(weight, g0, total.red), total.green = fma(weight, g1, total.green), total.blue = fma(weight, g2, total.blue);
+    };
+
     constexpr int kAhead = 32;  // entries prepared at a time; meanwhile the memory of the next ones comes near
-    TileEntry<R> chunk[kAhead];
-    const auto record_of = [&](int j) -> const Record<R>& { return args.records[args.ids[begin + j]]; };
-    const auto sums_of = [&](int j) { return all.sums + size_t(all.slots[begin + j]) * kSums; };
+    TileEntry<R> chunk[2 * kAhead];
+    const Pair* entries = args.pairs + begin;
+    const auto entry_of = [&](int j) -> TileEntry<R>& { return chunk[j % (2 * kAhead)]; };
+    const auto record_of = [&](int j) -> const Record<R>& { return args.records[entries[j].id]; };
+    const auto sums_of = [&](int j) { return all.sums + size_t(entries[j].place) * kSumStride; };
+
+    // A block is looked at before the one that was looked at last is added up, so that neither waits for the other.
+    const Totals nothing{zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+    Totals total = nothing;
+    Seen seen;
+    int open = -1;  // entry of the block last looked at
+    const auto close = [&] {
+        add(total, entry_of(open), open, seen);
+        const P<R> totals[kSums] = {total.e, total.er, total.es, total.err, total.ers, total.ess, total.red, total.green, total.blue, total.depth};
+        add_lanes(totals, sums_of(open));
+    };
     for (int j = n - 1; j >= 0; j--) {
         if (j == n - 1 || j % kAhead == kAhead - 1)
-            for (int i = j / kAhead * kAhead; i <= j; i++) prepare(chunk[i % kAhead], record_of(i), double(box.left), double(box.top));
+            for (int i = j / kAhead * kAhead; i <= j; i++)
+                if (entries[i].mask & heard) prepare(entry_of(i), record_of(i), double(box.left), double(box.top));
         if (j >= kAhead) __builtin_prefetch(&record_of(j - kAhead)), __builtin_prefetch(sums_of(j - kAhead), 1);
-        uint32_t mask = args.masks[begin + j] & heard;
-        all.written[all.slots[begin + j]] = mask != 0;
+        uint32_t mask = entries[j].mask & heard;
+        all.written[entries[j].place] = mask != 0;
         if (!mask) continue;
-        const TileEntry<R>& entry = chunk[j % kAhead];
-        P<R> e = zero, er = zero, es = zero, err = zero, ers = zero, ess = zero;
-        P<R> red = zero, green = zero, blue = zero, depth = zero;
-        for (; mask; mask &= mask - 1) {
-            const int b = __builtin_ctz(mask);
-            const Distance<R> d = distance(entry, b, rows);
-            const P<R> raw = uncapped_alpha(entry, d);
-            const auto counts = (p16(limits.alpha_min) <= raw) & (p16(R(j)) <= load<kLanes>(last[b]));
-            const P<R> alpha = select(counts, min(raw, p16(limits.alpha_max)), zero);
-            const P<R> before = load<kLanes>(light[b]) / (p16(R(1)) - alpha), weight = alpha * before;
-            store(light[b], before);
-            const P<R> g0 = load<kLanes>(up[0][b]), g1 = load<kLanes>(up[1][b]), g2 = load<kLanes>(up[2][b]);
-            P<R> own = fma(g0, p16(entry.look.red), fma(g1, p16(entry.look.green), g2 * p16(entry.look.blue)));
-            if constexpr (Extra) {
-                const P<R> g4 = load<kLanes>(up[4][b]);
-                own = fma(g4, p16(entry.look.depth), own + load<kLanes>(up[3][b]));
-                depth = fma(weight, g4, depth);
-            }
-            const P<R> back = load<kLanes>(behind[b]), gain = own - back;
-            store(behind[b], fma(alpha, gain, back));
-            const P<R> ge = select(raw <= p16(limits.alpha_max), weight * gain, zero);  // capped alpha passes none
-            const P<R> ge_r = ge * d.r, ge_s = ge * d.s;
-            e = e + ge, er = er + ge_r, es = es + ge_s;
-            err = fma(ge_r, d.r, err), ers = fma(ge_r, d.s, ers), ess = fma(ge_s, d.s, ess);
-            red = fma(weight, g0, red), green = fma(weight, g1, green), blue = fma(weight, g2, blue);
+        const TileEntry<R>& entry = entry_of(j);
+        Seen next = look(entry, mask);
+        if (open >= 0) close();
+        open = j, seen = next, total = nothing;
+        while (mask &= mask - 1) {
+            next = look(entry, mask);
+            add(total, entry, j, seen);
+            seen = next;
         }
-        const P<R> totals[kSums] = {e, er, es, err, ers, ess, red, green, blue, depth};
-        add_lanes(totals, sums_of(j));
     }
+    if (open >= 0) close();
 }
 
 template <class R>

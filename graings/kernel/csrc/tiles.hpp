@@ -10,8 +10,10 @@ template <class R> using P = Vec<R, kLanes>;
 template <class R> GRAINGS_INLINE P<R> p16(R x) { return splat<R, kLanes>(x); }
 
 // Of a tile's blocks: first pixel column and row.
-alignas(64) constexpr double kBlockX[kBlocks] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
-alignas(64) constexpr double kBlockY[kBlocks] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
+template <class T>
+alignas(64) constexpr T kBlockX[kBlocks] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
+template <class T>
+alignas(64) constexpr T kBlockY[kBlocks] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
 // Of a block's pixels: distance from its centre.
 template <class R>
 alignas(64) constexpr R kColumns[kLanes] = {-1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5};
@@ -20,25 +22,31 @@ alignas(64) constexpr R kRows[kLanes] = {-1.5, -1.5, -1.5, -1.5, -0.5, -0.5, -0.
 
 template <class R>
 GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top) {
-    using D = Vec<double, kBlocks>;
-    const auto all = [](double x) { return splat<double, kBlocks>(x); };
     const double sr = double(record.look.sr), sy = double(record.look.sy), dy = top + 2 - record.y, tilt = sr * record.slope;
-    const D x = load<kBlocks>(kBlockX), y = load<kBlocks>(kBlockY);
-    const D r = fma(all(sr), x, fma(all(-tilt), y, all(sr * ((left + 2 - record.x) - record.slope * dy))));
-    store(entry.base_r, rounded<R>(r)), store(entry.base_s, rounded<R>(fma(all(sy), y, all(sy * dy))));
+    entry.r = sr * ((left + 2 - record.x) - record.slope * dy), entry.s = sy * dy;
+    entry.sr = sr, entry.sy = sy, entry.tilt = tilt;
     store(entry.lanes, fma(p16(record.look.sr), load<kLanes>(kColumns<R>), p16(R(-tilt)) * load<kLanes>(kRows<R>)));
     entry.look = record.look, entry.lean = R(tilt);
 }
+template <class R>
+GRAINGS_INLINE R r_at(const TileEntry<R>& entry, int block) {
+    return R(fused(entry.sr, kBlockX<double>[block], fused(-entry.tilt, kBlockY<double>[block], entry.r)));
+}
+template <class R>
+GRAINGS_INLINE R s_at(const TileEntry<R>& entry, int block) { return R(fused(entry.sy, kBlockY<double>[block], entry.s)); }
 
 // Blocks that a prepared entry reaches, one bit each: those where the least exponent over the rectangle of pixel
 // centres is at most the record's level. With u = |r| less half the width of the block, or 0, the exponent
 // u^2 + s^2 is convex in dy and smooth. Where s is least, either u is 0 and nothing is lower, or the lowest point
-// lies on the side of r's sign, where u is linear, or at an end. `slack` is more than all rounding of r, here and in
-// the pixels; that of s, which is small wherever it matters, is in the record's level.
+// lies on the side of r's sign, where u is linear, or at an end. `edge` holds more than all rounding that grows with
+// the tile's size in r, here and in the pixels; what grows with r and s themselves, which are small wherever it
+// matters, is in the record's level.
 template <class R>
 GRAINGS_INLINE uint32_t reached_blocks(const TileEntry<R>& entry) {
     constexpr R unit = sizeof(R) == 4 ? R(6e-5) : R(1e-13);
-    const P<R> r = load<kLanes>(entry.base_r), s = load<kLanes>(entry.base_s), wide = p16(entry.look.sr), rise = p16(entry.look.sy), lean = p16(entry.lean), back = p16(R(0)) - lean;
+    const P<R> wide = p16(entry.look.sr), rise = p16(entry.look.sy), lean = p16(entry.lean), back = p16(R(0)) - lean;
+    const P<R> x = load<kLanes>(kBlockX<R>), y = load<kLanes>(kBlockY<R>);
+    const P<R> r = fma(wide, x, fma(back, y, p16(R(entry.r)))), s = fma(rise, y, p16(R(entry.s)));
     const P<R> zero = p16(R(0)), high = p16(R(1.5)), low = p16(R(-1.5)), half = high * wide, edge = fma(p16(unit), wide + abs(lean), half);
     const auto least = [&](P<R> t, P<R> dy) {
         const P<R> u = max(abs(t) - edge, zero), v = fma(rise, dy, s);
@@ -64,11 +72,15 @@ GRAINGS_INLINE void by_block(const uint16_t (&masks)[kChunk], uint64_t (&entries
         for (int b = 0; b < kBlocks; b++) entries[b] |= uint64_t(masks[j] >> b & 1) << j;
 #endif
 }
+
+// To look at so few blocks takes less than to find those of them that are not reached.
+constexpr int kFewBlocks = 2;
+
 template <class R> struct Distance { P<R> r, s; };
 
 template <class R>
 GRAINGS_INLINE Distance<R> distance(const TileEntry<R>& entry, int block, P<R> rows) {
-    return {load<kLanes>(entry.lanes) + p16(entry.base_r[block]), fma(p16(entry.look.sy), rows, p16(entry.base_s[block]))};
+    return {load<kLanes>(entry.lanes) + p16(r_at(entry, block)), fma(p16(entry.look.sy), rows, p16(s_at(entry, block)))};
 }
 
 template <class R>
@@ -127,9 +139,11 @@ GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& o
         light = select(counts, next, light);
         return {weight, counts};
     } else {
+        // what waits for the entry before is kept short: one comparison and one product
+        const P<R> alpha = select(drawn, capped, zero), passed = p16(R(1)) - alpha;
         const auto counts = stop <= light;
-        const P<R> alpha = select(drawn & counts, capped, zero), weight = alpha * light;
-        light = light * (p16(R(1)) - alpha);
+        const P<R> weight = select(counts, alpha * light, zero);
+        light = select(counts, light * passed, light);
         return {weight, counts};
     }
 }
@@ -153,7 +167,7 @@ GRAINGS_INLINE void to_rows(const R (*blocks)[kBlocks][kLanes], const TileBox& b
     }
 }
 
-template <class R, bool Compat, bool Keep>
+template <class R, bool Compat, bool Keep, bool Depth>
 GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
     const TileBox box = tile_box(args.camera, tile);
     const Rule<R> limits = rule<R>(args.settings);
@@ -172,11 +186,15 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
         const int n = int(end - k < kChunk ? end - k : kChunk);
         uint16_t masks[kChunk] = {};
         uint64_t lists[kBlocks];
-        for (int j = 0; j < n; j++) prepare(chunk[j], args.records[args.ids[k + j]], double(box.left), double(box.top));
         for (int j = 0; j < n; j++) {
-            if (k + j + kChunk < pairs) __builtin_prefetch(&args.records[args.ids[k + j + kChunk]]);  // maybe the next tile's
-            args.masks[k + j] = masks[j] = uint16_t((Compat ? 0xFFFFu : reached_blocks(chunk[j])) & live);
-            items += __builtin_popcount(masks[j]);
+            Pair& pair = args.pairs[k + j];
+            if (k + j + kChunk < pairs) __builtin_prefetch(&args.records[args.pairs[k + j + kChunk].id]);  // maybe the next tile's
+            if (pair.mask &= live) {
+                prepare(chunk[j], args.records[pair.id], double(box.left), double(box.top));
+                if (!Compat && __builtin_popcount(pair.mask) > kFewBlocks) pair.mask &= reached_blocks(chunk[j]);
+            }
+            masks[j] = uint16_t(pair.mask);
+            items += __builtin_popcount(pair.mask);
         }
         by_block(masks, lists);
         [[maybe_unused]] const R first = R(k - start);  // number in the tile
@@ -185,21 +203,36 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
             P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]);
             [[maybe_unused]] P<R> latest = Keep ? load<kLanes>(last[b]) : t;
             P<R> red = load<kLanes>(channels[0][b]), green = load<kLanes>(channels[1][b]);
-            P<R> blue = load<kLanes>(channels[2][b]), depth = load<kLanes>(channels[3][b]);
-            for (uint64_t list = lists[b]; list; list &= list - 1) {
+            P<R> blue = load<kLanes>(channels[2][b]);
+            [[maybe_unused]] P<R> depth = Depth ? load<kLanes>(channels[3][b]) : t;
+            uint64_t list = lists[b];
+            const auto first_of = [&](uint64_t entries) {
+                const TileEntry<R>& entry = chunk[__builtin_ctzll(entries)];
+                return uncapped_alpha(entry, distance(entry, b, rows));
+            };
+            P<R> raw = first_of(list);
+            for (uint64_t rest; list; list = rest) {
                 const int j = __builtin_ctzll(list);
                 const TileEntry<R>& entry = chunk[j];
-                const auto [weight, counts] = blend<R, Compat>(uncapped_alpha(entry, distance(entry, b, rows)), limits, t, going);
+                rest = list & (list - 1);
+                const P<R> next = rest ? first_of(rest) : raw;
+                const auto [weight, counts] = blend<R, Compat>(raw, limits, t, going);
+                if (!any(counts)) break;
+                raw = next;
                 if constexpr (Keep) latest = select(counts, p16(first + R(j)), latest);
                 red = fma(weight, p16(entry.look.red), red);
                 green = fma(weight, p16(entry.look.green), green);
                 blue = fma(weight, p16(entry.look.blue), blue);
-                depth = fma(weight, p16(entry.look.depth), depth);
+                if constexpr (Depth) depth = fma(weight, p16(entry.look.depth), depth);
             }
             store(light[b], t), store(open[b], going);
             if constexpr (Keep) store(last[b], latest);
-            store(channels[0][b], red), store(channels[1][b], green), store(channels[2][b], blue), store(channels[3][b], depth);
-            if (!any(Compat ? p16(R(0)) < going : p16(limits.transmittance_min) <= t)) live &= ~(1u << b);
+            store(channels[0][b], red), store(channels[1][b], green), store(channels[2][b], blue);
+            if constexpr (Depth) store(channels[3][b], depth);
+            if (any(Compat ? p16(R(0)) < going : p16(limits.transmittance_min) <= t)) continue;
+            live &= ~(1u << b);  // all its pixels have stopped: the gradient need not look at the rest
+            items -= __builtin_popcountll(list);
+            for (; list; list &= list - 1) args.pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);
         }
         k += n;
     }
@@ -217,7 +250,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
     }
     to_rows<3>(channels, box, args.camera.width, args.color);
     to_rows<1>(&light, box, args.camera.width, args.alpha);
-    to_rows<1>(channels + 3, box, args.camera.width, args.depth);
+    if constexpr (Depth) to_rows<1>(channels + 3, box, args.camera.width, args.depth);
 }
 
 // A tile that nothing touches.
@@ -231,16 +264,22 @@ GRAINGS_INLINE void draw_background(const TileArgs<R>& args, int64_t tile) {
     for (int y = 0; y < box.height; y++) {
         put_row<3>(color, box, y, args.camera.width, args.color);
         put_row<1>(nothing, box, y, args.camera.width, args.alpha);
-        put_row<1>(nothing, box, y, args.camera.width, args.depth);
+        if (args.depth) put_row<1>(nothing, box, y, args.camera.width, args.depth);
     }
+}
+
+template <class R, bool Depth>
+GRAINGS_INLINE void draw_some(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
+    if (args.settings.compat) draw<R, true, true, Depth>(args, tile, chunk);
+    else if (args.light) draw<R, false, true, Depth>(args, tile, chunk);
+    else draw<R, false, false, Depth>(args, tile, chunk);
 }
 
 template <class R>
 static void draw_tile(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
     if (args.begin[tile] == args.begin[tile + 1]) draw_background(args, tile);
-    else if (args.settings.compat) draw<R, true, true>(args, tile, chunk);
-    else if (args.light) draw<R, false, true>(args, tile, chunk);
-    else draw<R, false, false>(args, tile, chunk);
+    else if (args.depth) draw_some<R, true>(args, tile, chunk);
+    else draw_some<R, false>(args, tile, chunk);
 }
 
 }  // namespace graings::GRAINGS_ISA

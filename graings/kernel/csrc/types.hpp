@@ -7,9 +7,12 @@
 namespace graings {
 
 constexpr int kTile = 16;    // edge of a tile in pixels
-constexpr int kBlocks = 16;  // 4x4-pixel blocks per tile, row by row
+constexpr int kBlock = 4;    // edge of a block in pixels
+constexpr int kBlocks = 16;  // per tile, row by row
 constexpr int kLanes = 16;   // pixels per block, row by row
 constexpr int kSums = 10;    // partial sums per (tile, Gaussian)
+constexpr int kSumStride = 16;
+constexpr int64_t kLongestSide = int64_t(kBlock) << 16;  // of an image: blocks are counted in 16 bits
 
 struct Camera {
     double rotation[9];  // world to camera, row by row
@@ -39,21 +42,34 @@ struct alignas(64) Record {
 };
 static_assert(sizeof(Record<float>) == 64);
 
-// The (tile, Gaussian) pairs of one Gaussian: where its sums begin and how many tiles it touches, of those in columns
-// left..right and rows top..bottom.
+// The rectangle of blocks that a Gaussian may touch, from the image's left and top, and its pairs with tiles: how many
+// there are and where their places begin.
 struct Span {
-    uint32_t begin, count, left, right, top, bottom;
-    bool is_box() const { return count == (right - left + 1) * (bottom - top + 1); }
+    uint32_t begin, count;
+    uint16_t left, right, top, bottom;
+    static constexpr int kPerTile = kTile / kBlock;
+    uint32_t first_column() const { return left / kPerTile; }
+    uint32_t last_column() const { return right / kPerTile; }
+    uint32_t first_row() const { return top / kPerTile; }
+    uint32_t last_row() const { return bottom / kPerTile; }
+    uint32_t tiles() const { return (last_column() - first_column() + 1) * (last_row() - first_row() + 1); }
+    bool is_box() const { return count == tiles(); }
 };
 
-// A record seen from one tile. With a pixel's place in its block, r = base_r[block] + lanes[pixel] and
-// s = base_s[block] + sy * row are the scaled distances; the bases are rounded from float64, where large numbers may
-// cancel.
+// A Gaussian on a tile, and the tile's blocks that it may touch, one bit each.
+struct Pair {
+    uint32_t id, place, mask;  // place: where its sums go, contiguous per Gaussian
+};
+
+// A record seen from one tile: with a pixel's place in its block, the scaled distances are r = r_at(block) +
+// lanes[pixel] and s = s_at(block) + sy * row. What a block adds is found in float64, where large numbers may cancel,
+// from r and s at the centre of the first block.
 template <class R>
 struct alignas(64) TileEntry {
-    R lanes[kLanes], base_r[kBlocks], base_s[kBlocks];
+    R lanes[kLanes];
+    double r, s, sr, sy, tilt;  // tilt: sr slope
     Look<R> look;
-    R lean;  // sr slope
+    R lean;  // the tilt, rounded
 };
 
 template <class R>
@@ -84,22 +100,20 @@ struct TileArgs {
     const R* background;
     const Record<R>* records;
     const int64_t* begin;
-    const uint32_t* ids;
-    uint16_t* masks;      // blocks of the tile that the entry may touch and that were still open
+    Pair* pairs;          // masks: what the entry touches and was still open, once drawn
     int32_t* processed;   // entries per tile that were looked at before every pixel had stopped
     int32_t* items;       // (entry, block) pairs per tile
     R *light, *last;      // [tile, block, lane] for the gradient, or null: what passes all entries, and the number of
                           // the last entry of the tile that counted
-    R *color, *alpha, *depth;
+    R *color, *alpha, *depth;  // depth may be null
 };
 
 template <class R>
 struct TileGradientArgs {
     TileArgs<R> tiles;
-    const uint32_t* slots;             // where the sums of an entry go: contiguous per Gaussian, in tile order
     const R *v_color, *v_alpha, *v_depth;  // the last two may be null
-    R* sums;                           // [slot, kSums]
-    uint8_t* written;                  // [slot]: whether there are sums; there are none where all are 0
+    R* sums;                           // [pair, kSums]
+    uint8_t* written;                  // [pair]: whether there are sums; there are none where all are 0
     double* v_background;              // [tile, 3] or null
 };
 
@@ -109,7 +123,6 @@ struct GeometryGradientArgs {
     Settings settings;
     Inputs<R> in;
     const uint8_t* status;
-    const Record<R>* records;
     const Span* spans;          // per Gaussian
     const R* sums;
     const uint8_t* written;

@@ -1,0 +1,77 @@
+// Tells every tile which Gaussians it draws, and in which order. They are counted and entered as they come, and sorted
+// tile by tile, so that no thread walks what another one enters. Knows rectangles, depths and uids; nothing of pixels.
+#pragma once
+#include <algorithm>
+#include <array>
+#include <utility>
+#include <vector>
+#include "buffer.hpp"
+#include "pool.hpp"
+#include "types.hpp"
+
+namespace graings {
+
+inline int64_t pieces_of(int64_t count, int64_t piece) { return (count + piece - 1) / piece; }
+
+// Neighbours share Gaussians: a thread takes a few tiles at a time.
+template <class Visit>
+void each_tile(int threads, int64_t tiles, Visit visit) {
+    constexpr int64_t kTogether = 4;
+    parallel_for(threads, pieces_of(tiles, kTogether), [&](int worker, int64_t piece) {
+        for (int64_t tile = piece * kTogether; tile < std::min(tiles, (piece + 1) * kTogether); tile++) visit(worker, tile);
+    });
+}
+
+// A run of Gaussians, counted by one worker.
+struct Piece {
+    int64_t begin = 0, end = 0;
+    int worker = 0;
+    int64_t pairs = 0;
+    uint64_t least = ~uint64_t(0), most = 0;  // of their depths, as bits
+    std::array<int64_t, kStatuses> statuses{};
+};
+
+template <class R>
+class Binning {
+public:
+    Binning(const Camera&, bool compat, const Record<R>*, Span*, const double* depths, const int64_t* uids, int threads);
+
+    // Counts the pairs of a piece whose begin, end and worker are known. A worker counts one piece at a time.
+    void count(Piece&);
+
+    // Finds the pairs of all pieces, tile by tile in no order.
+    void enter(const std::vector<Piece>&);
+
+    // The pairs of all tiles, each tile's in order of (depth, uid).
+    Buffer<Pair> sorted();
+
+    int64_t count() const { return count_; }
+    Buffer<int64_t> begin;     // of each tile's pairs; one more at the end
+
+private:
+    struct Arrival {
+        uint32_t key, id, place, mask;
+    };
+    struct Scratch {
+        std::vector<std::pair<uint32_t, uint32_t>> half;  // what is left of the key, and whose
+        std::vector<Arrival> whole;
+    };
+    void enter(const Piece&, uint32_t place, uint32_t* next);
+    const Arrival* sort(const Arrival* from, int64_t count, Scratch&) const;
+    uint32_t key(int64_t id) const;
+
+    int64_t across_, tiles_, width_;
+    bool compat_;
+    const Record<R>* records_;
+    Span* spans_;
+    const double* depths_;
+    const int64_t* uids_;
+    int threads_;
+    uint64_t least_ = ~uint64_t(0);
+    int spare_bits_ = 0;                         // keys are left-aligned: their leading bits tell most
+    std::vector<std::vector<uint32_t>> counts_;  // of each worker that counted, per tile
+    int64_t count_ = 0;
+    Buffer<Arrival> arrivals_;
+};
+
+}  // namespace graings
