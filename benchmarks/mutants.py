@@ -283,8 +283,8 @@ MUTANTS = (
         "not-closed",
         "sums of an entry left open when the next one begins",
         TILE_GRADIENT,
-        "        if (open >= 0) close();\n        open = j",
-        "        open = j",
+        "            if (open >= 0) close();\n            open = j",
+        "            open = j",
     ),
     Mutant(
         "group-split",

@@ -62,8 +62,8 @@ Images = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]  # of a `RenderRes
 
 
 def _prepared(tensor: Tensor | None) -> Tensor | None:
-    """As the kernel takes it: without graph, one number after the other."""
-    return None if tensor is None else tensor.detach().contiguous()
+    """As the kernel takes it: one number after the other."""
+    return None if tensor is None else tensor.contiguous()
 
 
 def _addresses(*tensors: Tensor | None) -> list[int]:

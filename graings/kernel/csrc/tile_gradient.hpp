@@ -6,24 +6,25 @@
 
 namespace graings::GRAINGS_ISA {
 
-// out[q] = sum of the 16 numbers of v[q], for all sums of an entry at once.
+// out[q] = sum of the 16 numbers of v[q], for all sums of an entry at once; writes up to kSumStride numbers.
 template <class R>
 GRAINGS_INLINE void add_lanes(const P<R> (&v)[kSums], R* out) {
-#if defined(__AVX512F__)
+#if defined(__AVX2__)
     if constexpr (sizeof(R) == 4) {
-        // Halve three times, two vectors into one each time; each keeps its own part of the lanes.
-        const auto halves = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xDD)); };
-        const auto pairs = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_shuffle_ps(a, b, 0x88), _mm512_shuffle_ps(a, b, 0xDD)); };
-        __m512 quarter[3];
-        for (int i = 0; i < 3; i++) {
-            const __m512 last_two = halves((__m512)v[i < 2 ? 4 * i + 2 : 8].v, (__m512)v[i < 2 ? 4 * i + 3 : 9].v);
-            // lanes 4q..4q+3: the four partial sums of vector q
-            quarter[i] = i < 2 ? halves(halves((__m512)v[4 * i].v, (__m512)v[4 * i + 1].v), last_two) : halves(last_two, last_two);
-        }
-        const __m512 last = pairs(pairs(quarter[0], quarter[1]), pairs(quarter[2], quarter[2]));
-        // quad q: vector q of quarters 0, 1, 2, 2
-        const __m512i in_order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-        _mm512_store_ps(out, _mm512_permutexvar_ps(in_order, last));
+        // Halve four times: the first time alone, then two vectors into one; each keeps its own part of the lanes.
+        const auto half = [](const P<R>& x) {
+#if defined(__AVX512F__)
+            return _mm256_add_ps(_mm512_castps512_ps256((__m512)x.v), _mm512_extractf32x8_ps((__m512)x.v, 1));
+#else
+            return _mm256_add_ps((__m256)x.lo.v, (__m256)x.hi.v);
+#endif
+        };
+        const auto pairs = [](__m256 a, __m256 b) { return _mm256_add_ps(_mm256_shuffle_ps(a, b, 0x88), _mm256_shuffle_ps(a, b, 0xDD)); };
+        __m256 two[5];
+        for (int i = 0; i < 5; i++) two[i] = pairs(half(v[2 * i]), half(v[2 * i + 1]));
+        const __m256 first = pairs(two[0], two[1]), second = pairs(two[2], two[3]), last = pairs(two[4], two[4]);
+        _mm256_storeu_ps(out, _mm256_add_ps(_mm256_permute2f128_ps(first, second, 0x20), _mm256_permute2f128_ps(first, second, 0x31)));
+        _mm_storeu_ps(out + 8, _mm_add_ps(_mm256_castps256_ps128(last), _mm256_extractf128_ps(last, 1)));
         return;
     }
 #endif
@@ -141,15 +142,20 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     const auto record_of = [&](int j) -> const Record<R>& { return args.records[entries[j].id]; };
     const auto sums_of = [&](int j) { return all.sums + size_t(entries[j].place) * kSumStride; };
 
-    // A block is looked at before the one that was looked at last is added up, so that neither waits for the other.
     const Totals nothing{zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+    const auto put = [&](const Totals& total, int j) {
+        const P<R> totals[kSums] = {total.e, total.er, total.es, total.err, total.ers, total.ess, total.red, total.green, total.blue, total.depth};
+        add_lanes(totals, sums_of(j));
+    };
+    // Where there are registers enough, a block is looked at before the one looked at last is added up, so that neither
+    // waits for the other.
+    constexpr bool kOverlap = kOne<R, kLanes>;
     Totals total = nothing;
-    Seen seen;
-    int open = -1;  // entry of the block last looked at
+    [[maybe_unused]] Seen seen;
+    int open = -1;  // entry of the block looked at last
     const auto close = [&] {
         add(total, entry_of(open), open, seen);
-        const P<R> totals[kSums] = {total.e, total.er, total.es, total.err, total.ers, total.ess, total.red, total.green, total.blue, total.depth};
-        add_lanes(totals, sums_of(open));
+        put(total, open);
     };
     for (int j = n - 1; j >= 0; j--) {
         if (j == n - 1 || j % kAhead == kAhead - 1)
@@ -160,13 +166,19 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         all.written[entries[j].place] = mask != 0;
         if (!mask) continue;
         const TileEntry<R>& entry = entry_of(j);
-        Seen next = look(entry, mask);
-        if (open >= 0) close();
-        open = j, seen = next, total = nothing;
-        while (mask &= mask - 1) {
-            next = look(entry, mask);
-            add(total, entry, j, seen);
-            seen = next;
+        if constexpr (kOverlap) {
+            Seen next = look(entry, mask);
+            if (open >= 0) close();
+            open = j, seen = next, total = nothing;
+            while (mask &= mask - 1) {
+                next = look(entry, mask);
+                add(total, entry, j, seen);
+                seen = next;
+            }
+        } else {
+            total = nothing;
+            for (; mask; mask &= mask - 1) add(total, entry, j, look(entry, mask));
+            put(total, j);
         }
     }
     if (open >= 0) close();
