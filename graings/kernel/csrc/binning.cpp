@@ -41,7 +41,7 @@ void each_tile_row(const Record<R>& record, const Span& span, int64_t width, Vis
     }
 }
 
-// Blocks of a tile, one bit each, from its first block on up to one in column and row `last` or from one in `first` on.
+// Blocks of a tile, one bit each, row by row: those from a column or row of blocks on, and those up to it.
 constexpr uint32_t kColumnsFrom[] = {0xFFFF, 0xEEEE, 0xCCCC, 0x8888}, kColumnsTo[] = {0x1111, 0x3333, 0x7777, 0xFFFF};
 constexpr uint32_t kRowsFrom[] = {0xFFFF, 0xFFF0, 0xFF00, 0xF000}, kRowsTo[] = {0x000F, 0x00FF, 0x0FFF, 0xFFFF};
 
@@ -94,12 +94,12 @@ void Binning<R>::enter(const std::vector<Piece>& pieces) {
     uint64_t most = 0;
     std::vector<int64_t> places_at;
     for (const Piece& piece : pieces) {
-        places_at.push_back(count_);
-        count_ += piece.pairs;
+        places_at.push_back(pairs_);
+        pairs_ += piece.pairs;
         least_ = std::min(least_, piece.least), most = std::max(most, piece.most);
     }
-    if (count_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::length_error("more than 2^32 pairs of tile and Gaussian");
-    spare_bits_ = count_ ? 32 - int(std::bit_width(most - least_)) : 0;
+    if (pairs_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::length_error("more than 2^32 pairs of tile and Gaussian");
+    spare_bits_ = pairs_ ? 32 - int(std::bit_width(most - least_)) : 0;
     int64_t total = 0;
     for (int64_t tile = 0; tile < tiles_; tile++) {
         begin[size_t(tile)] = total;
@@ -108,7 +108,7 @@ void Binning<R>::enter(const std::vector<Piece>& pieces) {
         if (total - begin[size_t(tile)] > kMostEntries) throw std::length_error("more than 2^24 Gaussians on one tile");
     }
     begin[size_t(tiles_)] = total;
-    arrivals_ = Buffer<Arrival>(size_t(count_));
+    arrivals_ = Buffer<Arrival>(size_t(pairs_));
     parallel_for(threads_, int64_t(counts_.size()), [&](int, int64_t worker) {
         for (size_t k = 0; k < pieces.size(); k++)
             if (pieces[k].worker == worker) enter(pieces[k], uint32_t(places_at[k]), counts_[size_t(worker)].data());
@@ -157,7 +157,7 @@ void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next)
 
 template <class R>
 Buffer<Pair> Binning<R>::sorted() {
-    Buffer<Pair> out{size_t(count_)};
+    Buffer<Pair> out{size_t(pairs_)};
     std::vector<Scratch> scratch{size_t(threads_)};
     each_tile(threads_, tiles_, [&](int worker, int64_t tile) {
         const int64_t first = begin[size_t(tile)], count = begin[size_t(tile) + 1] - first;

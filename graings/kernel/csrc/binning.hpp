@@ -39,14 +39,14 @@ public:
     // Counts the pairs of a piece whose begin, end and worker are known. A worker counts one piece at a time.
     void count(Piece&);
 
-    // Finds the pairs of all pieces, tile by tile in no order.
+    // Enters the pairs of all pieces, tile by tile in no order.
     void enter(const std::vector<Piece>&);
 
     // The pairs of all tiles, each tile's in order of (depth, uid).
     Buffer<Pair> sorted();
 
-    int64_t count() const { return count_; }
-    Buffer<int64_t> begin;     // of each tile's pairs; one more at the end
+    int64_t pairs() const { return pairs_; }
+    Buffer<int64_t> begin;  // of each tile's pairs; one more at the end
 
 private:
     struct Arrival {
@@ -70,7 +70,7 @@ private:
     uint64_t least_ = ~uint64_t(0);
     int spare_bits_ = 0;                         // keys are left-aligned: their leading bits tell most
     std::vector<std::vector<uint32_t>> counts_;  // of each worker that counted, per tile
-    int64_t count_ = 0;
+    int64_t pairs_ = 0;
     Buffer<Arrival> arrivals_;
 };
 

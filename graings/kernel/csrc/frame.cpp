@@ -44,7 +44,7 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
     seconds_[kProject] = watch.lap();
     binning.enter(pieces);
     seconds_[kBin] = watch.lap();
-    pairs_ = binning.sorted(), pair_count_ = binning.count();
+    pairs_ = binning.sorted(), pair_count_ = binning.pairs();
     begin_ = std::move(binning.begin);
     seconds_[kSort] = watch.lap();
 
