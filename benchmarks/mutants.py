@@ -262,14 +262,14 @@ MUTANTS = (
         "bits-missing",
         "what agrees in the leading bits of its key left as it came",
         BINNING,
-        "if (!before(to[i], to[i - 1])) continue;",
-        "if (before(to[i], to[i]) || count > kFew) continue;",
+        "if (!before(pairs[i], pairs[i - 1])) continue;",
+        "if (before(pairs[i], pairs[i]) || count > kFew) continue;",
     ),
     Mutant(
         "moves-lost",
         "sort broken off where it moves too much",
         BINNING,
-        "std::sort(to, to + count, before);",
+        "std::sort(pairs, pairs + count, before);",
         "",
     ),
     Mutant(

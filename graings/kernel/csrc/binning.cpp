@@ -94,12 +94,12 @@ void Binning<R>::enter(const std::vector<Piece>& pieces) {
     uint64_t most = 0;
     std::vector<int64_t> places_at;
     for (const Piece& piece : pieces) {
-        places_at.push_back(pairs_);
-        pairs_ += piece.pairs;
+        places_at.push_back(count_);
+        count_ += piece.pairs;
         least_ = std::min(least_, piece.least), most = std::max(most, piece.most);
     }
-    if (pairs_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::length_error("more than 2^32 pairs of tile and Gaussian");
-    spare_bits_ = pairs_ ? 32 - int(std::bit_width(most - least_)) : 0;
+    if (count_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::length_error("more than 2^32 pairs of tile and Gaussian");
+    spare_bits_ = count_ ? 32 - int(std::bit_width(most - least_)) : 0;
     int64_t total = 0;
     for (int64_t tile = 0; tile < tiles_; tile++) {
         begin[size_t(tile)] = total;
@@ -108,7 +108,7 @@ void Binning<R>::enter(const std::vector<Piece>& pieces) {
         if (total - begin[size_t(tile)] > kMostEntries) throw std::length_error("more than 2^24 Gaussians on one tile");
     }
     begin[size_t(tiles_)] = total;
-    arrivals_ = Buffer<Arrival>(size_t(pairs_));
+    pairs = Buffer<Pair>(size_t(count_));
     parallel_for(threads_, int64_t(counts_.size()), [&](int, int64_t worker) {
         for (size_t k = 0; k < pieces.size(); k++)
             if (pieces[k].worker == worker) enter(pieces[k], uint32_t(places_at[k]), counts_[size_t(worker)].data());
@@ -117,7 +117,7 @@ void Binning<R>::enter(const std::vector<Piece>& pieces) {
 
 template <class R>
 void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next) {
-    Arrival nowhere, *out = arrivals_.get();
+    Pair nowhere, *out = pairs.get();
     for (int64_t i = piece.begin; i < piece.end; i++) {
         Span& span = spans_[i];
         span.begin += first_place;
@@ -129,10 +129,10 @@ void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next)
             uint32_t* at = next + span.first_row() * across_ + span.first_column();
             const uint32_t first_columns = columns ? left : left & right, first_rows = rows ? top : top & bottom;
             const auto put = [&](uint32_t& to, uint32_t there, uint32_t place, uint32_t mask) {
-                Arrival* arrival = out + to;
-                arrival = there ? arrival : &nowhere;
-                __builtin_prefetch(arrival + 4, 1);  // where this tile's next ones go
-                *arrival = {depth, id, place, mask}, to += there;
+                Pair* pair = out + to;
+                pair = there ? pair : &nowhere;
+                __builtin_prefetch(pair + 4, 1);  // where this tile's next ones go
+                *pair = {depth, id, place, mask}, to += there;
             };
             put(at[0], 1, begin, first_columns & first_rows), put(at[1], columns, begin + 1, right & first_rows);
             put(at[across_], rows, begin + columns + 1, first_columns & bottom), put(at[across_ + 1], columns & rows, begin + 3, right & bottom);
@@ -143,9 +143,9 @@ void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next)
             const uint32_t in_row = (row == span.first_row() ? top : 0xFFFF) & (row == span.last_row() ? bottom : 0xFFFF);
             uint32_t* at = next + int64_t(row) * across_;
             for (uint32_t column = from; column <= to; column++) {
-                Arrival* arrival = out + at[column]++;
-                __builtin_prefetch(arrival + 4, 1);
-                *arrival = {depth, id, place++, in_row & (column == span.first_column() ? left : 0xFFFF) & (column == span.last_column() ? right : 0xFFFF)};
+                Pair* pair = out + at[column]++;
+                __builtin_prefetch(pair + 4, 1);
+                *pair = {depth, id, place++, in_row & (column == span.first_column() ? left : 0xFFFF) & (column == span.last_column() ? right : 0xFFFF)};
             }
         };
         if (span.is_box())
@@ -156,30 +156,25 @@ void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next)
 }
 
 template <class R>
-Buffer<Pair> Binning<R>::sorted() {
-    Buffer<Pair> out{size_t(pairs_)};
+void Binning<R>::sort() {
     std::vector<Scratch> scratch{size_t(threads_)};
     each_tile(threads_, tiles_, [&](int worker, int64_t tile) {
-        const int64_t first = begin[size_t(tile)], count = begin[size_t(tile) + 1] - first;
-        const Arrival* in_order = sort(arrivals_.get() + first, count, scratch[size_t(worker)]);
-        for (int64_t i = 0; i < count; i++)
-            out[size_t(first + i)] = {in_order[i].id, in_order[i].place, in_order[i].mask};
+        const int64_t first = begin[size_t(tile)];
+        sort(pairs.get() + first, begin[size_t(tile) + 1] - first, scratch[size_t(worker)]);
     });
-    arrivals_ = {};
-    return out;
 }
 
 // By the leading bits of the key in two passes, as many bits as leave few neighbours equal; then those by comparison.
 template <class R>
-auto Binning<R>::sort(const Arrival* from, int64_t count, Scratch& scratch) const -> const Arrival* {
-    const auto before = [&](const Arrival& a, const Arrival& b) {
+void Binning<R>::sort(Pair* pairs, int64_t count, Scratch& scratch) const {
+    const auto before = [&](const Pair& a, const Pair& b) {
         if (a.key != b.key) return a.key < b.key;
         return std::tuple(depths_[a.id], uids_[a.id], a.id) < std::tuple(depths_[b.id], uids_[b.id], b.id);
     };
-    if (int64_t(scratch.whole.size()) < count) scratch.whole.resize(size_t(2 * count)), scratch.half.resize(size_t(2 * count));
-    Arrival* to = scratch.whole.data();
-    if (count <= kFew) std::copy(from, from + count, to);
-    else {
+    if (count > kFew) {
+        if (int64_t(scratch.whole.size()) < count) scratch.whole.resize(size_t(2 * count)), scratch.half.resize(size_t(2 * count));
+        Pair* from = scratch.whole.data();
+        std::copy(pairs, pairs + count, from);
         uint32_t least = ~uint32_t(0), most = 0;
         for (int64_t i = 0; i < count; i++) least = std::min(least, from[i].key), most = std::max(most, from[i].key);
         const int digit = std::min(int(std::bit_width(uint64_t(count))) - 1, kLongestDigit), bins = 1 << digit;
@@ -198,21 +193,20 @@ auto Binning<R>::sort(const Arrival* from, int64_t count, Scratch& scratch) cons
             const uint32_t l = lead(from[i].key);
             half[low[l & (bins - 1)]++] = {l >> digit, uint32_t(i)};
         }
-        for (int64_t i = 0; i < count; i++) to[high[half[i].first]++] = from[half[i].second];
+        for (int64_t i = 0; i < count; i++) pairs[high[half[i].first]++] = from[half[i].second];
     }
     int64_t moves = 16 * count;  // more are left to a sort that takes n log n whatever comes
     for (int64_t i = 1; i < count; i++) {
-        if (!before(to[i], to[i - 1])) continue;
-        const Arrival arrival = to[i];
+        if (!before(pairs[i], pairs[i - 1])) continue;
+        const Pair pair = pairs[i];
         int64_t j = i;
-        for (; j > 0 && before(arrival, to[j - 1]); j--) to[j] = to[j - 1];
-        to[j] = arrival;
+        for (; j > 0 && before(pair, pairs[j - 1]); j--) pairs[j] = pairs[j - 1];
+        pairs[j] = pair;
         if ((moves -= i - j) < 0) {
-            std::sort(to, to + count, before);
+            std::sort(pairs, pairs + count, before);
             break;
         }
     }
-    return to;
 }
 
 template class Binning<float>;

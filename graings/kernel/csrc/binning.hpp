@@ -42,22 +42,20 @@ public:
     // Enters the pairs of all pieces, tile by tile in no order.
     void enter(const std::vector<Piece>&);
 
-    // The pairs of all tiles, each tile's in order of (depth, uid).
-    Buffer<Pair> sorted();
+    // Brings each tile's pairs in order of (depth, uid).
+    void sort();
 
-    int64_t pairs() const { return pairs_; }
+    int64_t count() const { return count_; }
+    Buffer<Pair> pairs;
     Buffer<int64_t> begin;  // of each tile's pairs; one more at the end
 
 private:
-    struct Arrival {
-        uint32_t key, id, place, mask;
-    };
     struct Scratch {
         std::vector<std::pair<uint32_t, uint32_t>> half;  // what is left of the key, and whose
-        std::vector<Arrival> whole;
+        std::vector<Pair> whole;
     };
     void enter(const Piece&, uint32_t place, uint32_t* next);
-    const Arrival* sort(const Arrival* from, int64_t count, Scratch&) const;
+    void sort(Pair* pairs, int64_t count, Scratch&) const;
     uint32_t key(int64_t id) const;
 
     int64_t across_, tiles_, width_;
@@ -70,8 +68,7 @@ private:
     uint64_t least_ = ~uint64_t(0);
     int spare_bits_ = 0;                         // keys are left-aligned: their leading bits tell most
     std::vector<std::vector<uint32_t>> counts_;  // of each worker that counted, per tile
-    int64_t pairs_ = 0;
-    Buffer<Arrival> arrivals_;
+    int64_t count_ = 0;
 };
 
 }  // namespace graings

@@ -44,8 +44,8 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
     seconds_[kProject] = watch.lap();
     binning.enter(pieces);
     seconds_[kBin] = watch.lap();
-    pairs_ = binning.sorted(), pair_count_ = binning.pairs();
-    begin_ = std::move(binning.begin);
+    binning.sort();
+    pairs_ = std::move(binning.pairs), begin_ = std::move(binning.begin), pair_count_ = binning.count();
     seconds_[kSort] = watch.lap();
 
     const Kernels<R>& run = kernels<R>();

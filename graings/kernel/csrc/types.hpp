@@ -56,9 +56,12 @@ struct Span {
     bool is_box() const { return count == tiles(); }
 };
 
-// A Gaussian on a tile, and the tile's blocks that it may touch, one bit each.
+// A Gaussian on a tile.
 struct Pair {
-    uint32_t id, place, mask;  // place: where its sums go, contiguous per Gaussian
+    uint32_t key;    // of its depth
+    uint32_t id;
+    uint32_t place;  // where its sums go: contiguous per Gaussian
+    uint32_t mask;   // blocks of the tile that it may touch, one bit each
 };
 
 // A record seen from one tile: with a pixel's place in its block, the scaled distances are r = r_at(block) +
