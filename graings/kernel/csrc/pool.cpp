@@ -8,6 +8,7 @@
 #include <list>
 #include <mutex>
 #include <thread>
+#include <utility>
 #ifdef __linux__
 #include <pthread.h>
 #include <sched.h>
@@ -17,8 +18,9 @@ namespace graings {
 namespace {
 
 // Loops follow each other closely within a step, and waking a sleeping thread takes longer than many of them: who
-// waits looks about for this long before it sleeps. Short enough to cost a neighbour on the same core little.
-constexpr std::chrono::microseconds kLookAbout{60};
+// waits looks about for this long before it sleeps, first for itself, then offering its core to others in between. Who
+// gets it back late has a neighbour there and sleeps at once.
+constexpr std::chrono::microseconds kLookAbout{500}, kAlone{60}, kLate{30};
 
 void relax() {
 #if defined(__x86_64__)
@@ -30,13 +32,17 @@ void relax() {
 
 template <class Done>
 bool look_about(Done done) {
-    const auto until = std::chrono::steady_clock::now() + kLookAbout;
-    do {
+    const auto begin = std::chrono::steady_clock::now();
+    for (auto now = begin; now < begin + kLookAbout;) {
         for (int i = 0; i < 16; i++) {
             if (done()) return true;
             relax();
         }
-    } while (std::chrono::steady_clock::now() < until);
+        const bool offered = now > begin + kAlone;
+        if (offered) std::this_thread::yield();
+        const auto before = std::exchange(now, std::chrono::steady_clock::now());
+        if (offered && now > before + kLate) break;
+    }
     return done();
 }
 
