@@ -32,4 +32,5 @@ def show(axis: Any, title: str, rows: Mapping[int, Mapping[str, float]], parts: 
         axis.loglog(*zip(*points, strict=True), marker="o", markersize=3, label=label, **style)
     axis.set_xlabel(title)
     axis.grid(True, which="major", color="0.9")
-    axis.legend(fontsize=8, frameon=False, title=f"{parts} (slope)", title_fontsize=8)
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14), "ncols": 3}  # lines fill the whole axis
+    axis.legend(fontsize=8, frameon=False, title=f"{parts} (slope)", title_fontsize=8, **below)
