@@ -62,8 +62,12 @@ Images = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]  # of a `RenderRes
 
 
 def _prepared(tensor: Tensor | None) -> Tensor | None:
-    """As the kernel takes it: one number after the other."""
-    return None if tensor is None else tensor.contiguous()
+    """As the kernel takes it: one number after the other in memory, with its sign."""
+    if tensor is None:
+        return None
+    if tensor._is_zerotensor():  # autograd's zeros have no memory
+        tensor = tensor.clone()
+    return tensor.contiguous().resolve_neg()
 
 
 def _addresses(*tensors: Tensor | None) -> list[int]:

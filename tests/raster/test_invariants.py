@@ -193,6 +193,21 @@ def test_unused_outputs_need_no_gradient() -> None:
         assert gradient.abs().sum() > 0
 
 
+def test_what_torch_has_yet_to_negate_or_to_write_counts_as_what_it_says() -> None:
+    """The kernel reads memory, where a lazily negated tensor has the other sign and autograd's zeros are not."""
+    batch, camera = gaussians(50, 30), pinhole()
+    means = batch.means.clone().requires_grad_()
+    color = picture(replace(batch, means=means), camera).color
+    assert torch.equal(picture(replace(batch, means=torch._neg_view(-batch.means)), camera).color, color)
+    cotangent = upstream(camera)[..., :3]
+    (expected,) = torch.autograd.grad(color, means, cotangent, retain_graph=True)
+    (negated,) = torch.autograd.grad(color, means, torch._neg_view(-cotangent), retain_graph=True)
+    assert torch.equal(expected, negated)
+    assert expected.abs().amax() > 0
+    (silent,) = torch.autograd.grad(color, means, torch._efficientzerotensor(color.shape, dtype=color.dtype))
+    assert (silent == 0).all()
+
+
 def test_drawing_works_in_inference_mode() -> None:
     batch, camera = overlapping()
     background = torch.tensor(BACKGROUND, dtype=torch.float64)

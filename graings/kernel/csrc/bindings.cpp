@@ -44,10 +44,15 @@ auto* checked(const std::optional<Array>& array, size_t size, const char* name) 
 // checked shapes, dtypes and that numbers follow each other.
 using Address = uintptr_t;
 template <class T> T* at(Address address) { return reinterpret_cast<T*>(address); }
+template <class T> T* needed(Address address, int64_t count, const char* name) {
+    if (!address && count) throw std::invalid_argument(std::string(name) + " has no memory");
+    return at<T>(address);
+}
 
 template <class R>
 graings::Inputs<R> inputs(int64_t count, Address means, Address quats, Address log_scales, Address opacities, Address colors, Address background, Address offset) {
-    return {count, at<R>(means), at<R>(quats), at<R>(log_scales), at<R>(opacities), at<R>(colors), at<R>(offset), at<R>(background)};
+    return {count, needed<R>(means, count, "means"), needed<R>(quats, count, "quats"), needed<R>(log_scales, count, "log_scales"), needed<R>(opacities, count, "opacities"),
+            needed<R>(colors, count, "colors"), at<R>(offset), needed<R>(background, 3, "background")};
 }
 
 template <class R>
@@ -151,7 +156,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
                  const auto in = inputs<R>(count, means, quats, log_scales, opacities, colors, background, offset);
                  const graings::Gradients<R> out{at<R>(g_means), at<R>(g_quats), at<R>(g_log_scales), at<R>(g_opacities), at<R>(g_colors), at<R>(g_background), at<R>(g_offset)};
                  nb::gil_scoped_release release;
-                 frame.gradient(in, at<R>(v_color), at<R>(v_alpha), at<R>(v_depth), out, threads);
+                 frame.gradient(in, needed<R>(v_color, 1, "v_color"), at<R>(v_alpha), at<R>(v_depth), out, threads);
              });
     m.def(draw_name,
           [](int64_t count, Address means, Address quats, Address log_scales, Address opacities, Address colors, Address background, Address offset, Address uids,
@@ -165,7 +170,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
               const graings::Settings settings{alpha_min, transmittance_min, alpha_max, blur, near, far, frustum_margin, compat};
               const graings::Outputs<R> out{at<R>(color), at<R>(alpha), at<R>(depth), at<R>(means2d), at<R>(radii)};
               nb::gil_scoped_release release;
-              return new Frame<R>(camera, settings, in, at<int64_t>(uids), out, threads, gradient);
+              return new Frame<R>(camera, settings, in, needed<int64_t>(uids, count, "uids"), out, threads, gradient);
           },
           nb::rv_policy::take_ownership);
     m.def("encode", [](In<R> x, int64_t dimensions, int octaves, Out<R> encoded, int threads) {
