@@ -91,11 +91,10 @@ def _draw(
     means = inputs[0]
     assert means is not None
     n, height, width = len(means), camera.height, camera.width
-    flat = means.new_empty(height, width) if depth else None
     images = (
         means.new_empty(height, width, 3),
         means.new_empty(height, width),
-        flat,
+        means.new_empty(height, width) if depth else None,
         means.new_empty(n, 2),
         means.new_empty(n, 2),
     )

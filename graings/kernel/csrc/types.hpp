@@ -11,7 +11,7 @@ constexpr int kBlock = 4;    // edge of a block in pixels
 constexpr int kBlocks = 16;  // per tile, row by row
 constexpr int kLanes = 16;   // pixels per block, row by row
 constexpr int kSums = 10;    // partial sums per (tile, Gaussian)
-constexpr int kSumStride = 16;
+constexpr int kSumStride = 16;  // numbers from one pair's sums to the next: a cache line in single precision
 constexpr int64_t kLongestSide = int64_t(kBlock) << 16;  // of an image: blocks are counted in 16 bits
 
 struct Camera {
