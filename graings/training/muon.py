@@ -15,6 +15,7 @@ from typing import Final
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 MOMENTUM: Final = 0.95
 
@@ -24,6 +25,11 @@ ITERATIONS: Final = 5
 
 # A matrix whose norm is below this is taken for nothing and moves less: 1e-15, as for Adam, for each of 1 000 entries.
 NOTHING: Final = 1e-12
+
+# Entries below this share of a matrix's norm count as none. They decide no digit of the step, but a hidden unit that
+# nothing wakes any more leaves momentum that fades by a twentieth a step, for ever, and its fourth powers would be
+# subnormal numbers, each of which costs some CPUs 150 cycles: two hundred milliseconds a step instead of two.
+FADED: Final = 1e-9
 
 # Root mean square of an Adam update at rate 1, roughly: with it the same rate fits both.
 ADAM_RMS: Final = 0.2
@@ -57,7 +63,7 @@ def orthogonal(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row column
     """
     # In double precision, in which no square of a single overflows.
     norm = torch.linalg.vector_norm(matrix, dtype=torch.float64)
-    flat = (matrix / norm.clamp_min(NOTHING)).to(matrix.dtype)
+    flat = functional.hardshrink((matrix / norm.clamp_min(NOTHING)).to(matrix.dtype), FADED)
     upright = flat.shape[0] > flat.shape[1]
     if upright:  # the products of the short side are the cheaper ones
         flat = flat.mT
