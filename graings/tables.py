@@ -10,8 +10,9 @@ import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from graings.work_precision import POINT_KEYS, TRAINING_PHASES
+from graings.work_precision import LATER_POINT_KEYS, POINT_KEYS, TRAINING_PHASES
 
+_POINT_KEYS = (*POINT_KEYS, *LATER_POINT_KEYS)
 TIME_KEYS = ("target_db", "train_s", "iteration", "gaussians", "censored_at_s", "at_most_s", "reason")
 
 
@@ -19,7 +20,7 @@ def tables(document: Mapping[str, Any]) -> dict[str, str]:
     """CSV texts of a report by file name; `render.csv` only where something was rendered."""
     training, render = document["training"], document["render"]
     made = {
-        "points.csv": _csv(("run", *POINT_KEYS), _rows(training, "points", POINT_KEYS)),
+        "points.csv": _csv(("run", *_POINT_KEYS), _rows(training, "points", _POINT_KEYS)),
         "time_to_psnr.csv": _csv(("run", *TIME_KEYS), _rows(training, "time_to_psnr", TIME_KEYS)),
         "phases.csv": _csv(("run", "phase", "seconds", "is_training"), _phases(training)),
     }

@@ -31,6 +31,10 @@ TOLERANCE: Final = 0.02
 QUANTISATION_RMSE: Final = 1 / (255 * math.sqrt(12))
 
 POINT_KEYS: Final = ("iteration", "train_s", "total_s", "psnr", "rmse", "ssim_3dgs", "views", "gaussians", "anchors")
+
+# What runs of earlier versions did not measure: null there.
+LATER_POINT_KEYS: Final = ("step_over_size", "subpixel_share")
+
 _KEYS: Final = (
     *("splits", "train_s", "total_s", "phases_s", "iterations", "gaussians", "anchors", "bytes", "curve", "events"),
     *("capture", "machine", "versions", "seed", "hashes"),
@@ -78,7 +82,11 @@ def run_names(paths: Sequence[Path]) -> list[str]:
 
 def training_part(name: str, metrics: Mapping[str, Any], run: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """One run as a part of kind `training`; `run` is its `run.json`, where there is one."""
-    points = [{key: point[key] for key in POINT_KEYS} for point in metrics["curve"] if point["psnr"] is not None]
+    points = [
+        {key: point[key] for key in POINT_KEYS} | {key: point.get(key) for key in LATER_POINT_KEYS}
+        for point in metrics["curve"]
+        if point["psnr"] is not None
+    ]
     config = (run or {}).get("config", {})
     wanted = config.get("iterations")
     finished = bool(metrics["splits"]) if wanted is None else metrics["iterations"] >= wanted
@@ -112,6 +120,7 @@ def training_part(name: str, metrics: Mapping[str, Any], run: Mapping[str, Any] 
         "final": {split: _final(values) for split, values in metrics["splits"].items()},
         "time_to_psnr": time_to_psnr(points),
         "events": metrics["events"],
+        "stiffness": metrics.get("stiffness"),
         "reference": {
             "what": "held-out photographs of the split val, rounded to 8 bits",
             "psnr": "mean over views of -20 log10 RMSE, in dB",

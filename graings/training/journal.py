@@ -25,6 +25,7 @@ from graings.report_folder import report_training
 from graings.scene.scene import Scene
 from graings.training.guard import Guard
 from graings.training.pace import Clock
+from graings.training.stiffness import Stiffness
 from graings.work_precision import run_names
 
 SCHEMA = "graings.run/1"
@@ -45,6 +46,8 @@ class EvaluationPoint:
     views: int
     gaussians: int
     anchors: int
+    step_over_size: float | None
+    subpixel_share: float | None
 
 
 class Journal:
@@ -65,7 +68,7 @@ class Journal:
         """Keep what happened at `iteration`."""
         self.events += [{"iteration": iteration, "what": what} for what in events]
 
-    def point(self, iteration: int, metrics: SplitMetrics, anchors: int) -> EvaluationPoint:
+    def point(self, iteration: int, metrics: SplitMetrics, anchors: int, stiffness: Stiffness) -> EvaluationPoint:
         """Add what held-out views say at `iteration` to the curve. Raises `ValueError` without a view."""
         if metrics.psnr is None or metrics.ssim_3dgs is None:
             raise ValueError("a point of the curve needs at least one view")
@@ -78,6 +81,8 @@ class Journal:
             views=len(metrics.views),
             gaussians=self.gaussians,
             anchors=anchors,
+            step_over_size=stiffness.step_over_size,
+            subpixel_share=stiffness.subpixel_share,
         )
         self.curve.append({**asdict(point), "total_s": self.clock.total_s()})
         return point
@@ -126,11 +131,12 @@ class Journal:
         threads: int,
         splits: dict[str, Any],
         compact: dict[str, Any] | None = None,
+        stiffness: Stiffness | None = None,
     ) -> None:
         """Write metrics.json, curve.svg and report/ as of `iteration`.
 
-        `splits` are the metrics of whole splits by name, `compact` the facts of the compact model; both only exist
-        once the run has ended.
+        `splits` are the metrics of whole splits by name, `compact` the facts of the compact model and `stiffness` that
+        of the end over all training views; they only exist once the run has ended.
         """
         started = time.perf_counter()
         background = self.config.capture.background_rgb()
@@ -165,6 +171,7 @@ class Journal:
             "skipped_steps": guard.skipped,
             "clipped_steps": guard.clipped,
             "rollbacks": guard.rollbacks,
+            "stiffness": None if stiffness is None else asdict(stiffness) | {"stiff": stiffness.stiff},
             "diverged": self.diverged is not None,
             "diverged_reason": self.diverged,
             "machine": machine,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from graings.run_folder import MODEL_FILE, sole_trainer
 from graings.threads import use_threads
 from graings.training.journal import EvaluationPoint, Journal
 from graings.training.pace import Clock, Rate, evaluation_marks
+from graings.training.stiffness import Stiffness, subpixel_share
 from graings.training.trainer import StepReport, Trainer
 
 
@@ -155,7 +156,8 @@ class TrainingRun:
             if saving and not last:
                 self._save()
             if last:
-                point = self._finish()
+                point, said = self._finish()
+                found += said
             yield RunReport(
                 **({part.name: getattr(step, part.name) for part in fields(step)} | {"events": step.events + found}),
                 iterations_per_s=rate.per_second(),
@@ -220,18 +222,25 @@ class TrainingRun:
         self._write_metrics({})
         return point
 
-    def _finish(self) -> EvaluationPoint | None:
-        """Evaluate all of val, write the final checkpoint, metrics and curve."""
+    def _finish(self) -> tuple[EvaluationPoint | None, tuple[str, ...]]:
+        """Evaluate all of val, write the final checkpoint, metrics and curve; returns the last point, and events."""
         point = None
+        started = time.perf_counter()
         if self.capture.val:
-            started = time.perf_counter()
             background = self.config.capture.background_rgb()
             point = self._point(evaluate(self._trainer.scene, self._held_out(), self.images, background))
-            self._journal.clock.add("evaluation", time.perf_counter() - started)
+        stiffness = self._stiffness(self.capture.train)
+        self._journal.clock.add("evaluation", time.perf_counter() - started)
+        said = _words(stiffness)
+        self._journal.note(self.iteration, said)
         splits = self._splits()
         self._save(finished=True)
-        self._write_metrics(splits, self._export())
-        return point
+        self._write_metrics(splits, self._export(), stiffness)
+        return point, said
+
+    def _stiffness(self, frames: Sequence[Frame]) -> Stiffness:
+        trainer, background = self._trainer, self.config.capture.background_rgb()
+        return Stiffness(trainer.step_over_size, subpixel_share(trainer.scene, frames, background), len(frames))
 
     def _export(self) -> dict[str, Any]:
         """Write the newest checkpoint as one small file: its name, its bytes, and the PSNR it has on all of val."""
@@ -273,7 +282,7 @@ class TrainingRun:
                 self._journal.gaussians = int(state.facts["gaussians"])
         splits = self._splits()
         self._save(instead_of_later=True)
-        self._write_metrics(splits, self._export())
+        self._write_metrics(splits, self._export(), self._stiffness(self.capture.train))
 
     def _is_complete(self) -> bool:
         """Whether the metrics document is that of the last iteration."""
@@ -282,9 +291,23 @@ class TrainingRun:
         document = read_metrics(self.metrics_path)
         return bool(document["iterations"] == self.iterations and (document["splits"] or not self.capture.val))
 
-    def _write_metrics(self, splits: dict[str, Any], compact: dict[str, Any] | None = None) -> None:
+    def _write_metrics(
+        self, splits: dict[str, Any], compact: dict[str, Any] | None = None, stiffness: Stiffness | None = None
+    ) -> None:
         trainer = self._trainer
-        self._journal.write_metrics(self.iteration, trainer.scene, trainer.guard, self.threads, splits, compact)
+        facts = (self.threads, splits, compact, stiffness)
+        self._journal.write_metrics(self.iteration, trainer.scene, trainer.guard, *facts)
 
     def _point(self, metrics: SplitMetrics) -> EvaluationPoint:
-        return self._journal.point(self.iteration, metrics, self._trainer.scene.scaffold.count)
+        stiffness = self._stiffness(subset(self.capture.train, self.config.evaluation.views))
+        return self._journal.point(self.iteration, metrics, self._trainer.scene.scaffold.count, stiffness)
+
+
+def _words(stiffness: Stiffness) -> tuple[str, ...]:
+    """What a user is told of a run that ended stiff."""
+    if not stiffness.stiff:
+        return ()
+    return (
+        f"stiff: the last steps still move the Gaussians by {stiffness.step_over_size:.3g} times their thinnest axis "
+        "(99th percentile). Train longer, or with smaller last `rates` of offsets, deformation and matrices.",
+    )

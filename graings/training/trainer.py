@@ -31,6 +31,7 @@ from graings.training.initialize import make_scene
 from graings.training.optimizer import Optimizer
 from graings.training.regularisers import regularisers
 from graings.training.snapshots import Snapshots
+from graings.training.stiffness import step_over_size
 from graings.training.streams import Streams, ViewSampler
 from graings.training.time_window import TimeWindow
 
@@ -90,6 +91,7 @@ class Trainer:
         self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
         self.times = capture.times
         self.iteration = 0
+        self.step_over_size: float | None = None  # of the last step that was measured
         start = make_scene(capture, images, config, self.streams)
         self.scene = start.scene
         self.window = TimeWindow(config, [frame.time for frame in capture.train], start.time_window)
@@ -155,6 +157,8 @@ class Trainer:
                     (frame.camera.width, frame.camera.height),
                 )
             self.optimizer.step(self.iteration)
+            if self.iteration % self.config.guard.check_every == 0 or self.iteration == self.config.iterations:
+                self._measure(composition, frame)
         else:
             self.optimizer.clear()
             events.append(f"skipped: {verdict.culprit} was not finite on {frame.name} at t = {frame.time:.4g}")
@@ -173,6 +177,12 @@ class Trainer:
             seconds=time.perf_counter() - started,
             events=tuple(events),
         )
+
+    @torch.no_grad()
+    def _measure(self, before: Composition, frame: Frame) -> None:
+        """How far the step just taken moved what `frame` shows."""
+        after = self.scene.compose(frame.camera.center, frame.time)
+        self.step_over_size = step_over_size(before.gaussians, after.gaussians)
 
     def _opening(self) -> list[str]:
         """At the first step, what was decided before it; in words."""

@@ -1,0 +1,95 @@
+"""Stiffness: whether the optimiser's steps fit the sizes of what they move, and how much is too small for any view.
+
+Steps longer than the Gaussians they move shake a scene instead of shaping it, and the scales of a Gaussian far smaller
+than a pixel get next to no gradient: the low-pass of the footprint hides them. Knows nothing of schedules, rates or
+losses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from graings import constants
+from graings.capture.capture import Frame
+from graings.gaussians import Gaussians
+from graings.render import draw
+from graings.scene.scene import Scene
+
+# Share of Gaussians whose step is no longer than `step_over_size` says.
+SHARE: Final = 0.99
+
+# Above this a step is longer than what it moves is thin.
+STIFF: Final = 1.0
+
+# A footprint below this many px, both axes together, is too small for its scales to be learned.
+SUBPIXEL: Final = 0.1
+
+# Fainter Gaussians count as unseen: their footprint ends where it begins.
+SEEN: Final = 2 * constants.ALPHA_MIN
+
+
+@dataclass(frozen=True, slots=True)
+class Stiffness:
+    """What one moment of training says: kappa_step and f_sub, None where nothing was measured or is drawn.
+
+    `views` is how many training views `subpixel_share` looked at.
+    """
+
+    step_over_size: float | None
+    subpixel_share: float | None
+    views: int
+
+    @property
+    def stiff(self) -> bool:
+        """Whether the last step that was measured was too long for the scene."""
+        return self.step_over_size is not None and self.step_over_size > STIFF
+
+
+def step_over_size(before: Gaussians, after: Gaussians) -> float | None:
+    """kappa_step: how far one step moved Gaussians, over the length of their thinnest axis; 99th percentile.
+
+    Of those drawn both times, known by their uids; None where there are none. Both are of the same instant.
+    """
+    uids = (before.uids.numpy(), after.uids.numpy())
+    _, here, there = np.intersect1d(*uids, assume_unique=True, return_indices=True)
+    if len(here) == 0:
+        return None
+    moved = after.means.detach()[there].double() - before.means.detach()[here].double()
+    thinnest = after.log_scales.detach()[there].double().amin(1).exp()
+    return float(np.quantile((moved.norm(dim=1) / thinnest).numpy(), SHARE))
+
+
+@torch.no_grad()
+def subpixel_share(scene: Scene, frames: Sequence[Frame], background: Sequence[float]) -> float | None:
+    """f_sub: share of the Gaussians seen in `frames` whose footprint stays below a tenth of a pixel in all of them.
+
+    None where none is seen.
+    """
+    slots = scene.scaffold.count * scene.scaffold.slots
+    seen, wide = torch.zeros(slots, dtype=torch.bool), torch.zeros(slots, dtype=torch.bool)
+    for frame in frames:
+        composition = scene.compose(frame.camera.center, frame.time)
+        gaussians, radii = composition.gaussians, draw(composition, frame.camera, background).radii
+        visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
+        seen[composition.children[visible]] = True
+        wide[composition.children[visible & (footprints(gaussians, radii) >= SUBPIXEL)]] = True
+    count = int(seen.sum())
+    return int((seen & ~wide).sum()) / count if count else None
+
+
+def footprints(gaussians: Gaussians, radii: Float[Tensor, "gaussian 2"]) -> Float[Tensor, " gaussian"]:
+    """Size in px of what was drawn with `radii`: the root of the sum of both squared axes, without the low-pass.
+
+    A radius is where alpha falls below the least that is drawn: sqrt(2 ln(o / alpha_min) (variance + blur)). Means
+    something where a Gaussian was drawn, and more than just so.
+    """
+    level = 2 * (gaussians.opacities.double() / constants.ALPHA_MIN).log()
+    variances = radii.double().square() / level.unsqueeze(1) - constants.BLUR
+    return variances.sum(1).clamp_min(0).sqrt()
