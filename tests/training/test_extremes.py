@@ -120,8 +120,7 @@ def test_images_of_one_constant_colour_are_learned_and_hardly_grow(
     assert finite(trainer)
     assert reports[-1].loss < 1e-2
     assert trainer.guard.rollbacks == 0
-    # Black and white do not grow; grey ends at the border of the pictures, where no view agrees with another.
-    assert trainer.scene.scaffold.count <= 1.2 * start
+    assert trainer.scene.scaffold.count <= 1.1 * start
 
 
 def test_alpha_that_is_zero_everywhere_is_refused(tmp_path: Path) -> None:

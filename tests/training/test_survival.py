@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from graings.checkpoint import load_model
 from graings.errors import DivergedError
@@ -403,25 +405,42 @@ def test_a_scene_in_which_all_is_hidden_is_shown_again_once_and_then_goes_back(m
     assert len(said(again, "rolled back to iteration 125: nothing was drawn any more")) == 1
 
 
-def test_a_rotation_at_the_zero_quaternion_is_finite_and_leaves_it(micro: Path) -> None:
-    """E13: the residual that cancels the identity, then noise in its place."""
-    trainer = micro_trainer(micro, warmup=0)
+def _noisy_rotations(capture: Path, count: int) -> Iterator[tuple[int, Trainer, Tensor]]:
+    """E13: the residual that cancels the identity, then noise in every step; lengths of all quaternions as they go."""
+    trainer = micro_trainer(capture, warmup=0, iterations=max(count, 200))
     assert trainer.scene.deformation is not None
     bias = trainer.scene.deformation.out.bias
     with torch.no_grad():
         bias[3] = -1.0
     noise = torch.Generator().manual_seed(0)
     frame = trainer.capture.train[0]
-    for _ in range(150):
+    for step in range(1, count + 1):
         trainer.step()
         with torch.no_grad():
             bias[3:7] += 0.01 * torch.randn(4, generator=noise)
+            if step % 50 == 0:
+                composition = trainer.scene.compose(frame.camera.center, frame.time)
+                assert draw(composition, frame.camera, trainer.background).culled["zero_quat"] == 0
+                yield step, trainer, composition.gaussians.quats.norm(dim=-1)
     assert finite(trainer)
     assert trainer.guard.rollbacks == 0
-    composition = trainer.scene.compose(frame.camera.center, frame.time)
-    length = composition.gaussians.quats.detach().norm(dim=-1)
-    assert bool(((length > 0.01) & (length < 10)).all())
-    assert draw(composition, frame.camera, trainer.background).culled["zero_quat"] == 0
+
+
+def test_a_rotation_at_the_zero_quaternion_is_finite_and_leaves_it(micro: Path) -> None:
+    """E13, its first steps: away from a length of 0.03."""
+    for _, _, lengths in _noisy_rotations(micro, 150):
+        assert bool(((lengths > 0.01) & (lengths < 10)).all())
+
+
+@pytest.mark.slow
+def test_ten_thousand_noisy_steps_leave_rotations_well_inside_their_bounds(micro: Path) -> None:
+    """E13, all of it: once they have left zero, lengths between 0.1 and 10."""
+    seen = 0
+    for step, _, lengths in _noisy_rotations(micro, 10_000):
+        if step >= 1_000:
+            assert bool(((lengths > 0.1) & (lengths < 10)).all()), f"step {step}: {lengths.min()} to {lengths.max()}"
+            seen += len(lengths)
+    assert seen > 0
 
 
 def test_a_quaternion_and_its_negative_draw_the_same_bits() -> None:
