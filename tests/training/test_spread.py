@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from graings.capture.synthetic import write_synthetic
+from graings.config import SceneConfig
 from graings.evaluation import evaluate
 from tests.training.micro import GROWING, micro_trainer, plain_training, quality, steps
 
@@ -24,10 +25,14 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_seeds_end_within_a_decibel(small: Path) -> None:
-    """E08, with growth, to the end of a schedule of 1 000 iterations."""
+    """E08: the default model, with growth, to the end of a schedule of 1 000 iterations.
+
+    Networks as small as those of the other tests end 0.4 to 0.5 dB apart (standard deviation), these 0.3.
+    """
+    model = {f"scene.{name}": value for name, value in SceneConfig().model_dump().items()}
     found = []
     for seed in SEEDS:
-        trainer = micro_trainer(small, seed=seed, iterations=1_000, **GROWING)
+        trainer = micro_trainer(small, seed=seed, iterations=1_000, **GROWING, **model)
         before = quality(trainer)
         steps(trainer, 1_000)
         found.append(quality(trainer))
