@@ -298,8 +298,16 @@ MUTANTS = (
         "relu-passed",
         "gradient passed through a closed ReLU",
         f"{SOURCE}/layers.hpp",
-        "select(load<width>(levels[l] + i) <= zero, zero, load<width>(below + i))",
-        "max(load<width>(below + i), load<width>(below + i))",
+        "select(load<width>(levels[l] + r * in + c) <= zero, zero, sum)",
+        "select(load<width>(levels[l] + r * in + c) <= zero, sum, sum)",
+        SCENE,
+    ),
+    Mutant(
+        "panels",
+        "panels of weights that overlap",
+        f"{SOURCE}/perceptron.cpp",
+        "(column / kPanel * rows + row) * kPanel",
+        "(column / kPanel + row) * kPanel",
         SCENE,
     ),
     Mutant(

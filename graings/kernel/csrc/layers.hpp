@@ -12,37 +12,42 @@ constexpr int kStripRows = 8;  // 8 x 2 accumulators: enough to hide the latency
 constexpr int kStripRows = 4;  // 16 registers hold no more
 #endif
 
-// c[kStripRows, vectors] (+)= a b over `depth`; row m of `a` starts at a + m * a_row and advances by a_step.
-template <class R, int vectors, bool add>
-GRAINGS_INLINE void strip(int64_t depth, const R* a, int64_t a_row, int64_t a_step, const R* b, int64_t b_row, R* c, int64_t c_row) {
+// c[kStripRows, vectors] = end(begin + a b) over `depth`; row m of `a` starts at a + m * a_row and advances by a_step.
+// `begin` and `end` are told the row and column of a vector of c, which starts at `row` and `column`.
+template <class R, int vectors, class Begin, class End>
+GRAINGS_INLINE void strip(int64_t depth, const R* a, int64_t a_row, int64_t a_step, const R* b, int64_t b_row, R* c, int64_t c_row, int64_t row, int64_t column, Begin begin, End end) {
     constexpr int width = kNative<R>;
     Native<R> sums[kStripRows][vectors];
     for (int m = 0; m < kStripRows; m++)
-        for (int v = 0; v < vectors; v++) {
-            if constexpr (add) std::memcpy(&sums[m][v], c + m * c_row + v * width, sizeof sums[m][v]);
-            else sums[m][v] = Native<R>{};
-        }
+        for (int v = 0; v < vectors; v++) sums[m][v] = begin(row + m, column + v * width).v;
     for (int64_t k = 0; k < depth; k++) {
-        Native<R> row[vectors];
-        for (int v = 0; v < vectors; v++) std::memcpy(&row[v], b + k * b_row + v * width, sizeof row[v]);
+        Native<R> factors[vectors];
+        for (int v = 0; v < vectors; v++) factors[v] = load<width>(b + k * b_row + v * width).v;
         for (int m = 0; m < kStripRows; m++) {
             const Native<R> factor = splat<R, width>(a[m * a_row + k * a_step]).v;
-            for (int v = 0; v < vectors; v++) sums[m][v] = fused(factor, row[v], sums[m][v]);
+            for (int v = 0; v < vectors; v++) sums[m][v] = fused(factor, factors[v], sums[m][v]);
         }
     }
     for (int m = 0; m < kStripRows; m++)
-        for (int v = 0; v < vectors; v++) std::memcpy(c + m * c_row + v * width, &sums[m][v], sizeof sums[m][v]);
+        for (int v = 0; v < vectors; v++) store(c + (row + m) * c_row + column + v * width, end(Vec<R, width>{sums[m][v]}, row + m, column + v * width));
 }
 
-// c[rows, columns] (+)= a b. `rows` is a multiple of kStripRows and `columns` of kNetworkPad.
-template <class R, bool add>
-GRAINGS_INLINE void multiply(int64_t rows, int64_t columns, int64_t depth, const R* a, int64_t a_row, int64_t a_step, const R* b, int64_t b_row, R* c, int64_t c_row) {
+// c[rows, columns] = end(begin + a b). `rows` is a multiple of kStripRows and `columns` of kNetworkPad. Rows of b advance
+// by b_row, panels of kPanel columns by b_panel: packed, a panel keeps to its own lines of the first level of cache, where
+// rows of 128 numbers would meet in an eighth of its sets.
+template <class R, class Begin, class End>
+GRAINGS_INLINE void multiply(int64_t rows, int64_t columns, int64_t depth, const R* a, int64_t a_row, int64_t a_step, const R* b, int64_t b_row, int64_t b_panel, R* c, int64_t c_row, Begin begin, End end) {
     constexpr int64_t width = kNative<R>;
+    static_assert(kPanel % (2 * width) == 0);
     int64_t column = 0;
-    for (; column + 2 * width <= columns; column += 2 * width)
-        for (int64_t m = 0; m < rows; m += kStripRows) strip<R, 2, add>(depth, a + m * a_row, a_row, a_step, b + column, b_row, c + m * c_row + column, c_row);
-    for (; column < columns; column += width)
-        for (int64_t m = 0; m < rows; m += kStripRows) strip<R, 1, add>(depth, a + m * a_row, a_row, a_step, b + column, b_row, c + m * c_row + column, c_row);
+    for (; column + 2 * width <= columns; column += 2 * width) {
+        const R* from = b + column / kPanel * b_panel + column % kPanel;
+        for (int64_t m = 0; m < rows; m += kStripRows) strip<R, 2>(depth, a + m * a_row, a_row, a_step, from, b_row, c, c_row, m, column, begin, end);
+    }
+    for (; column < columns; column += width) {
+        const R* from = b + column / kPanel * b_panel + column % kPanel;
+        for (int64_t m = 0; m < rows; m += kStripRows) strip<R, 1>(depth, a + m * a_row, a_row, a_step, from, b_row, c, c_row, m, column, begin, end);
+    }
 }
 
 GRAINGS_INLINE int64_t whole_strips(int64_t rows) { return (rows + kStripRows - 1) / kStripRows * kStripRows; }
@@ -65,12 +70,11 @@ GRAINGS_INLINE void place(const NetworkArgs<R>& args, int64_t row, R* scratch, R
     for (int l = 1; l < args.layers; l++) levels[l] = block + (args.offsets[l] - args.offsets[1]);
 }
 
-// The bias of layer l in every row of a block, and what the row's group adds to the first.
+// The bias of the first layer in every row of a block, and what the row's group adds to it.
 template <class R>
-GRAINGS_INLINE void begin_layer(const NetworkArgs<R>& args, int l, int64_t row, int64_t rows, int64_t strips, R* to) {
-    const int64_t out = args.padded[l + 1], width = args.widths[l + 1];
-    for (int64_t r = 0; r < strips; r++) std::memcpy(to + r * out, args.biases[l], sizeof(R) * size_t(out));
-    if (l > 0 || !args.shared) return;
+GRAINGS_INLINE void begin_rows(const NetworkArgs<R>& args, int64_t row, int64_t rows, int64_t strips, R* to) {
+    const int64_t out = args.padded[1], width = args.widths[1];
+    for (int64_t r = 0; r < strips; r++) std::memcpy(to + r * out, args.biases[0], sizeof(R) * size_t(out));
     for (int64_t r = 0; r < rows; r++) {
         const R* shared = args.shared + args.groups[row + r] * width;
         for (int64_t c = 0; c < width; c++) to[r * out + c] += shared[c];
@@ -102,10 +106,15 @@ static void network_values(const NetworkArgs<R>& args, int64_t begin, int64_t en
         for (int l = 0; l < args.layers; l++) {
             const int64_t in = args.padded[l], out = args.padded[l + 1];
             R* to = levels[l + 1];
-            begin_layer(args, l, row, rows, strips, to);
-            multiply<R, true>(strips, out, args.widths[l], levels[l], in, 1, args.forward[l], out, to, out);
-            if (l + 1 < args.layers)
-                for (int64_t i = 0; i < strips * out; i += width) store(to + i, max(zero, load<width>(to + i)));
+            const R* bias = args.biases[l];
+            const auto values = [&](auto begin, auto end) { multiply(strips, out, args.widths[l], levels[l], in, int64_t(1), args.forward[l], kPanel, in * kPanel, to, out, begin, end); };
+            const auto biased = [&](auto end) {
+                if (l > 0 || !args.shared) return values([&](int64_t, int64_t c) { return load<width>(bias + c); }, end);
+                begin_rows(args, row, rows, strips, to);
+                values([&](int64_t r, int64_t c) { return load<width>(to + r * out + c); }, end);
+            };
+            if (l + 1 < args.layers) biased([&](auto sum, int64_t, int64_t) { return max(zero, sum); });
+            else biased([](auto sum, int64_t, int64_t) { return sum; });
         }
         const int64_t last = args.widths[args.layers];
         for (int64_t r = 0; r < rows; r++) std::memcpy(args.output + (row + r) * last, levels[args.layers] + r * args.padded[args.layers], sizeof(R) * size_t(last));
@@ -126,7 +135,8 @@ static void network_gradient(const NetworkArgs<R>& args, int64_t begin, int64_t 
         for (int l = args.layers - 1; l >= 0; l--) {
             const int64_t in = args.padded[l], out = args.padded[l + 1];
             R *weight = sums + args.weight_at[l], *bias = sums + args.bias_at[l];
-            multiply<R, true>(out, in, rows, above, 1, out, levels[l], in, weight, in);
+            const auto as_is = [](auto sum, int64_t, int64_t) { return sum; };
+            multiply(out, in, rows, above, int64_t(1), out, levels[l], in, kPanel, weight, in, [&](int64_t r, int64_t c) { return load<width>(weight + r * in + c); }, as_is);
             for (int64_t c = 0; c < out; c += width) {
                 auto sum = load<width>(bias + c);
                 for (int64_t r = 0; r < rows; r++) sum = sum + load<width>(above + r * out + c);
@@ -134,13 +144,14 @@ static void network_gradient(const NetworkArgs<R>& args, int64_t begin, int64_t 
             }
             if (l == 0 && args.shared) add_to_groups(args, begin, row, rows, above, sums);
             if (l == 0 && !args.v_input) break;
-            multiply<R, false>(strips, in, args.widths[l + 1], above, out, 1, args.backward[l], in, below, in);
+            const auto zero = splat<R, width>(R(0));
+            const auto backwards = [&](auto end) { multiply(strips, in, args.widths[l + 1], above, out, int64_t(1), args.backward[l], kPanel, out * kPanel, below, in, [&](int64_t, int64_t) { return zero; }, end); };
             if (l == 0) {
+                backwards(as_is);
                 for (int64_t r = 0; r < rows; r++) std::memcpy(args.v_input + (row + r) * args.widths[0], below + r * in, sizeof(R) * size_t(args.widths[0]));
                 break;
             }
-            const auto zero = splat<R, width>(R(0));
-            for (int64_t i = 0; i < rows * in; i += width) store(below + i, select(load<width>(levels[l] + i) <= zero, zero, load<width>(below + i)));
+            backwards([&](auto sum, int64_t r, int64_t c) { return select(load<width>(levels[l] + r * in + c) <= zero, zero, sum); });
             R* done = above;
             above = below, below = done;
         }

@@ -15,6 +15,9 @@ constexpr int64_t kPieceRows = 8 * kNetworkRows;
 
 int64_t up(int64_t n, int64_t step) { return (n + step - 1) / step * step; }
 
+// Where an element of a matrix of `rows` rows lies in panels of kPanel columns.
+int64_t in_panels(int64_t row, int64_t column, int64_t rows) { return (column / kPanel * rows + row) * kPanel + column % kPanel; }
+
 // The weights as the loops want them, in both directions, with zeros in the padding.
 template <class R>
 struct Packed {
@@ -36,7 +39,8 @@ struct Packed {
         for (int l = 0; l < args.layers; l++) {
             const int64_t weight = args.padded[l] * args.padded[l + 1];
             args.weight_at[l] = sums, args.bias_at[l] = sums + weight, sums += weight + args.padded[l + 1];
-            size += (gradient ? 2 : 1) * weight + args.padded[l + 1];
+            size += args.padded[l] * up(args.padded[l + 1], kPanel) + args.padded[l + 1];
+            if (gradient) size += args.padded[l + 1] * up(args.padded[l], kPanel);
         }
         args.first_group_at = sums;
         numbers = Buffer<R>(size_t(size));
@@ -45,15 +49,15 @@ struct Packed {
         for (int l = 0; l < args.layers; l++) {
             const int64_t in = args.padded[l], out = args.padded[l + 1], ins = args.widths[l], outs = args.widths[l + 1];
             const R* weight = network.weights[size_t(l)];
-            R *forward = at, *bias = at + in * out, *backward = bias + out;
+            R *forward = at, *bias = at + in * up(out, kPanel), *backward = bias + out;
             for (int64_t o = 0; o < outs; o++)
                 for (int64_t i = 0; i < ins; i++) {
-                    forward[i * out + o] = weight[o * ins + i];
-                    if (gradient) backward[o * in + i] = weight[o * ins + i];
+                    forward[in_panels(i, o, in)] = weight[o * ins + i];
+                    if (gradient) backward[in_panels(o, i, out)] = weight[o * ins + i];
                 }
             std::copy_n(network.biases[size_t(l)], outs, bias);
             args.forward[l] = forward, args.biases[l] = bias, args.backward[l] = backward;
-            at += (gradient ? 2 : 1) * in * out + out;
+            at = gradient ? backward + out * up(in, kPanel) : backward;
         }
     }
 };

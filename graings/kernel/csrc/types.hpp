@@ -146,6 +146,7 @@ struct SsimArgs {
 constexpr int kMaxLayers = 16;
 constexpr int64_t kNetworkRows = 64;  // rows at a time: their activations fit the second level of cache
 constexpr int64_t kNetworkPad = 16;   // widths are padded to a multiple of this
+constexpr int64_t kPanel = 32;        // weights lie in panels of so many columns, each row behind the one before
 
 // A network packed for the loops. Level 0 is the input, level `layers` the output.
 template <class R>
@@ -154,8 +155,8 @@ struct NetworkArgs {
     int64_t widths[kMaxLayers + 1], padded[kMaxLayers + 1], widest;
     int64_t offsets[kMaxLayers + 2];  // of each level's activations in the scratch, then of two gradients
     int64_t weight_at[kMaxLayers], bias_at[kMaxLayers];  // in a set of partial sums
-    const R* forward[kMaxLayers];   // [in, out]
-    const R* backward[kMaxLayers];  // [out, in]; of the gradient only
+    const R* forward[kMaxLayers];   // [in, out], in panels
+    const R* backward[kMaxLayers];  // [out, in], in panels; of the gradient only
     const R* biases[kMaxLayers];
     const R *input, *v_output;
     R *output, *v_input;  // v_input may be null
