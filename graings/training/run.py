@@ -308,6 +308,6 @@ def _words(stiffness: Stiffness) -> tuple[str, ...]:
     if not stiffness.stiff:
         return ()
     return (
-        f"stiff: the last steps still move the Gaussians by {stiffness.step_over_size:.3g} times their thinnest axis "
+        f"stiff: the last steps still move the Gaussians by {stiffness.step_over_size:.3g} times their own size "
         "(99th percentile). Train longer, or with smaller last `rates` of offsets, deformation and matrices.",
     )

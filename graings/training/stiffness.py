@@ -15,17 +15,20 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from graings import constants
+from graings.camera import Camera
 from graings.capture.capture import Frame
 from graings.gaussians import Gaussians
 from graings.render import draw
+from graings.scene.children import quaternion_product
 from graings.scene.scene import Scene
 
 # Share of Gaussians whose step is no longer than `step_over_size` says.
 SHARE: Final = 0.99
 
-# Above this a step is longer than what it moves is thin.
+# Above this a step is longer than what it moves.
 STIFF: Final = 1.0
 
 # A footprint below this many px, both axes together, is too small for its scales to be learned.
@@ -52,18 +55,24 @@ class Stiffness:
         return self.step_over_size is not None and self.step_over_size > STIFF
 
 
-def step_over_size(before: Gaussians, after: Gaussians) -> float | None:
-    """kappa_step: how far one step moved Gaussians, over the length of their thinnest axis; 99th percentile.
+def step_over_size(before: Gaussians, after: Gaussians, camera: Camera) -> float | None:
+    """kappa_step: how far one step moved Gaussians over their own size in that direction, 99th percentile.
 
-    Of those drawn both times, known by their uids; None where there are none. Both are of the same instant.
+    The size is what `camera` can see of it, with the low-pass of the footprint at its distance: a disc thinner than any
+    pixel, moved by its own thickness, moves nothing. Of those drawn both times, known by their uids; None where there
+    are none. Both are of the same instant.
     """
     uids = (before.uids.numpy(), after.uids.numpy())
     _, here, there = np.intersect1d(*uids, assume_unique=True, return_indices=True)
     if len(here) == 0:
         return None
-    moved = after.means.detach()[there].double() - before.means.detach()[here].double()
-    thinnest = after.log_scales.detach()[there].double().amin(1).exp()
-    return float(np.quantile((moved.norm(dim=1) / thinnest).numpy(), SHARE))
+    means, quats = after.means.detach()[there].double(), normalize(after.quats.detach()[there].double(), dim=1)
+    moved = pad(means - before.means.detach()[here].double(), (1, 0))  # as a quaternion without a real part
+    conjugates = quats * quats.new_tensor([1, -1, -1, -1])
+    along = quaternion_product(quaternion_product(conjugates, moved), quats)[:, 1:]  # in each Gaussian's own axes
+    pixel = (means - torch.from_numpy(camera.center)).norm(dim=1, keepdim=True) / camera.fx
+    sizes = (after.log_scales.detach()[there].double().mul(2).exp() + constants.BLUR * pixel.square()).sqrt()
+    return float(np.quantile((along / sizes).norm(dim=1).numpy(), SHARE))
 
 
 @torch.no_grad()

@@ -182,7 +182,7 @@ class Trainer:
     def _measure(self, before: Composition, frame: Frame) -> None:
         """How far the step just taken moved what `frame` shows."""
         after = self.scene.compose(frame.camera.center, frame.time)
-        self.step_over_size = step_over_size(before.gaussians, after.gaussians)
+        self.step_over_size = step_over_size(before.gaussians, after.gaussians, frame.camera)
 
     def _opening(self) -> list[str]:
         """At the first step, what was decided before it; in words."""
