@@ -59,6 +59,7 @@ class Journal:
         self.config = config
         self.plan = plan
         self.clock = clock
+        self.versions = version_facts()  # of the code that trains: a checkout may move on before the end
         self.curve: list[dict[str, Any]] = []
         self.events: list[dict[str, Any]] = []
         self.gaussians = 0
@@ -118,7 +119,7 @@ class Journal:
             },
             "config": self.config.model_dump(mode="json"),
             "plan": self.plan.to_json(),
-            "versions": version_facts(),
+            "versions": self.versions,
         }
         write_metrics(self.folder / "run.json", document)
         self.clock.add("report", time.perf_counter() - started)
@@ -141,7 +142,7 @@ class Journal:
         started = time.perf_counter()
         background = self.config.capture.background_rgb()
         fps = frames_per_second(scene, subset(self.capture.train, FPS_VIEWS), background)
-        machine, versions = machine_facts(threads), version_facts()
+        machine = machine_facts(threads)
         self.clock.add("report", time.perf_counter() - started)
         started = time.perf_counter()
         document = {
@@ -175,7 +176,7 @@ class Journal:
             "diverged": self.diverged is not None,
             "diverged_reason": self.diverged,
             "machine": machine,
-            "versions": versions,
+            "versions": self.versions,
             "seed": self.config.seed,
             "hashes": {"config": config_hash(self.config), "capture": self.capture.content_hash},
         }

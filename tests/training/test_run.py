@@ -75,6 +75,17 @@ def test_training_lowers_the_held_out_error_and_writes_everything(capture: Path,
     assert load_model(tmp_path / "run").finished
 
 
+def test_the_commit_is_that_of_the_code_that_trained(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A long run ends long after it began, and its checkout may have moved on."""
+    commits = iter(["first", "second", "third"])
+    monkeypatch.setattr("graings.training.journal.version_facts", lambda: {"commit": next(commits)})
+    list(TrainingRun.create(capture, tmp_path / "run", _config()))
+    said = [json.loads((tmp_path / "run" / name).read_text())["versions"] for name in ("run.json", "metrics.json")]
+    assert said == [{"commit": "first"}] * 2
+
+
 def test_a_slow_evaluation_costs_total_time_and_no_training_time(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
