@@ -128,7 +128,7 @@ def _take_steps(run: TrainingRun) -> Interrupt:
     """Train to the end, or to a checkpoint where a signal asked to stop; returns who would have heard it."""
     with (
         TrainingProgress(Console(), run.iteration, run.iterations) as progress,
-        Interrupt(lambda: progress.note("stopping after this step; once more to stop at once")) as interrupt,
+        Interrupt("stopping after this step; once more to stop at once") as interrupt,
     ):
         for note in run.capture.notes:
             progress.note(note)

@@ -2,24 +2,29 @@
 
 A step that is cut in half cannot be resumed bit for bit, so the first signal only waits to be noticed; a second
 one ends the process at once. Knows nothing of training.
+
+The answer to a signal goes past all buffers: it may have come in the middle of a print, and printing within printing is
+an error that would end what was only to be paused.
 """
 
 from __future__ import annotations
 
+import os
 import signal
-from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
+STDERR = 2
+
 
 class Interrupt:
-    """A context in the main thread; `received` is the first signal that came, or None."""
+    """A context in the main thread; `received` is the first signal that came, or None. It is answered by `answer`."""
 
-    def __init__(self, announce: Callable[[], None]) -> None:
+    def __init__(self, answer: str) -> None:
         self.received: int | None = None
-        self._announce = announce
+        self._answer = f"\n{answer}\n".encode()
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupt:
@@ -39,7 +44,7 @@ class Interrupt:
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = number
         self._restore()
-        self._announce()
+        os.write(STDERR, self._answer)
 
     def _restore(self) -> None:
         while self._before:
