@@ -9,6 +9,7 @@ an error that would end what was only to be paused.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from types import FrameType, TracebackType
@@ -44,7 +45,8 @@ class Interrupt:
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = number
         self._restore()
-        os.write(STDERR, self._answer)
+        with contextlib.suppress(OSError):  # Ctrl-C ends the `tee` behind us too: who is not heard still stops in order
+            os.write(STDERR, self._answer)
 
     def _restore(self) -> None:
         while self._before:

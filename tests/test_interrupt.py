@@ -46,3 +46,19 @@ def test_a_signal_in_the_middle_of_a_print_is_answered_and_nothing_breaks(
     assert raw.written.split(b"\n")[:2] == [b"a line", b"another"]
     assert "stopping soon" in capfd.readouterr().err
     assert interrupt.exit_code == 128 + number
+
+
+def test_a_signal_stops_also_where_nobody_listens_any_more() -> None:
+    """Ctrl-C goes to the whole pipe: with `2>&1 | tee log` the reader is gone when the answer is written."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    kept = os.dup(2)
+    os.dup2(writing, 2)
+    try:
+        with Interrupt("stopping soon") as interrupt:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert interrupt.received == signal.SIGINT
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(writing)

@@ -231,7 +231,7 @@ class TrainingRun:
             point = self._point(evaluate(self._trainer.scene, self._held_out(), self.images, background))
         stiffness = self._stiffness(self.capture.train)
         self._journal.clock.add("evaluation", time.perf_counter() - started)
-        said = _words(stiffness)
+        said = stiffness.events()
         self._journal.note(self.iteration, said)
         splits = self._splits()
         self._save(finished=True)
@@ -301,13 +301,3 @@ class TrainingRun:
     def _point(self, metrics: SplitMetrics) -> EvaluationPoint:
         stiffness = self._stiffness(subset(self.capture.train, self.config.evaluation.views))
         return self._journal.point(self.iteration, metrics, self._trainer.scene.scaffold.count, stiffness)
-
-
-def _words(stiffness: Stiffness) -> tuple[str, ...]:
-    """What a user is told of a run that ended stiff."""
-    if not stiffness.stiff:
-        return ()
-    return (
-        f"stiff: the last steps still move the Gaussians by {stiffness.step_over_size:.3g} times their own size "
-        "(99th percentile). Train longer, or with smaller last `rates` of offsets, deformation and matrices.",
-    )

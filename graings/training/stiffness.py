@@ -54,13 +54,22 @@ class Stiffness:
         """Whether the last step that was measured was too long for the scene."""
         return self.step_over_size is not None and self.step_over_size > STIFF
 
+    def events(self) -> tuple[str, ...]:
+        """What a user is told of a run that ended like this."""
+        if not self.stiff:
+            return ()
+        return (
+            f"stiff: the last steps still move the Gaussians by {self.step_over_size:.3g} times their own size "
+            "(99th percentile). Train longer, or with smaller last `rates` of offsets, deformation and matrices.",
+        )
+
 
 def step_over_size(before: Gaussians, after: Gaussians, camera: Camera) -> float | None:
     """kappa_step: how far one step moved Gaussians over their own size in that direction, 99th percentile.
 
     The size is what `camera` can see of it, with the low-pass of the footprint at its distance: a disc thinner than any
     pixel, moved by its own thickness, moves nothing. Of those drawn both times, known by their uids; None where there
-    are none. Both are of the same instant.
+    are none, or where one of them is lost. Both are of the same instant.
     """
     uids = (before.uids.numpy(), after.uids.numpy())
     _, here, there = np.intersect1d(*uids, assume_unique=True, return_indices=True)
@@ -72,7 +81,8 @@ def step_over_size(before: Gaussians, after: Gaussians, camera: Camera) -> float
     along = quaternion_product(quaternion_product(conjugates, moved), quats)[:, 1:]  # in each Gaussian's own axes
     pixel = (means - torch.from_numpy(camera.center)).norm(dim=1, keepdim=True) / camera.fx
     sizes = (after.log_scales.detach()[there].double().mul(2).exp() + constants.BLUR * pixel.square()).sqrt()
-    return float(np.quantile((along / sizes).norm(dim=1).numpy(), SHARE))
+    lengths = (along / sizes).norm(dim=1)
+    return float(np.quantile(lengths.numpy(), SHARE)) if bool(lengths.isfinite().all()) else None
 
 
 @torch.no_grad()

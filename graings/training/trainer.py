@@ -91,7 +91,6 @@ class Trainer:
         self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
         self.times = capture.times
         self.iteration = 0
-        self.step_over_size: float | None = None  # of the last step that was measured
         start = make_scene(capture, images, config, self.streams)
         self.scene = start.scene
         self.window = TimeWindow(config, [frame.time for frame in capture.train], start.time_window)
@@ -105,6 +104,7 @@ class Trainer:
         self.guard = Guard(self.config.guard)
         self.collapse = Collapse()
         self.average = Average()
+        self.step_over_size: float | None = None  # of the last step that was measured and not undone since
 
     def __iter__(self) -> Iterator[StepReport]:
         while self.iteration < self.config.iterations:

@@ -17,12 +17,12 @@ from graings.constants import BLUR
 from graings.gaussians import Gaussians
 from graings.raster.rasterize import rasterize
 from graings.raster.reference import _rotations
-from graings.training.run import TrainingRun, _words
+from graings.training.run import TrainingRun
 from graings.training.stiffness import STIFF, Stiffness, footprints, step_over_size, subpixel_share
 from tests.capture.captures import orbit
 from tests.models import tiny_scene
 from tests.scenes import gaussians, pinhole, rows
-from tests.training.micro import finite, micro_config, micro_trainer, steps
+from tests.training.micro import finite, micro_config, micro_trainer, said, steps
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -44,6 +44,26 @@ def test_a_step_is_measured_in_sizes_of_what_is_there_both_times() -> None:
     common = step_over_size(rows(before, torch.arange(950)), rows(after, order), sharp)
     assert common == pytest.approx((100 + 0.99 * 849) / 999, abs=1e-6)
     assert step_over_size(rows(before, torch.arange(10)), rows(after, torch.arange(10, 20)), sharp) is None
+
+
+def test_what_is_lost_has_no_length() -> None:
+    before = gaussians(10, seed=0)
+    for lost in (math.nan, math.inf):
+        means = before.means.clone()
+        means[3, 1] = lost
+        assert step_over_size(before, replace(before, means=means), pinhole()) is None
+
+
+def test_a_step_that_was_undone_is_not_told_of(micro: Path) -> None:
+    """Metrics hold finite numbers only: a lost scene is measured, found, and forgotten with the step."""
+    trainer = micro_trainer(micro, **{"guard.check_every": 5})
+    steps(trainer, 29)
+    assert trainer.step_over_size is not None
+    with torch.no_grad():
+        trainer.scene.scaffold.offsets[0] = math.inf
+    report = trainer.step()
+    assert said([report], "rolled back")
+    assert trainer.step_over_size is None
 
 
 def test_what_is_thinner_than_a_pixel_is_as_wide_as_the_low_pass() -> None:
@@ -123,23 +143,23 @@ def test_a_run_says_how_stiff_it_was(micro: Path, tmp_path: Path) -> None:
         config = micro_config(iterations=100, **{"rates.offsets": (rate, rate), "rates.log_scales": (1e-5, 1e-5)})
         reports = list(TrainingRun.create(micro, tmp_path / name, config))
         document = json.loads((tmp_path / name / "metrics.json").read_text())
-        said = document["stiffness"]
-        found[name] = said["step_over_size"]
-        assert said["stiff"] is (found[name] > STIFF)
-        assert said["views"] == 6
-        assert 0 <= said["subpixel_share"] <= 1
+        facts = document["stiffness"]
+        found[name] = facts["step_over_size"]
+        assert facts["stiff"] is (found[name] > STIFF)
+        assert facts["views"] == 6
+        assert 0 <= facts["subpixel_share"] <= 1
         assert document["curve"][-1]["step_over_size"] == found[name]
-        assert any(event.startswith("stiff: ") for event in reports[-1].events) is said["stiff"]
-        assert any(event["what"].startswith("stiff: ") for event in document["events"]) is said["stiff"]
+        assert any(event.startswith("stiff: ") for event in reports[-1].events) is facts["stiff"]
+        assert any(event["what"].startswith("stiff: ") for event in document["events"]) is facts["stiff"]
     assert found["calm"] < 0.1
     assert found["wild"] > 10 * found["calm"]
 
 
 def test_what_is_longer_than_itself_is_stiff_and_told_with_its_remedy() -> None:
-    assert _words(Stiffness(1.5, 0.0, 6)) == (
+    assert Stiffness(1.5, 0.0, 6).events() == (
         "stiff: the last steps still move the Gaussians by 1.5 times their own size (99th percentile). "
         "Train longer, or with smaller last `rates` of offsets, deformation and matrices.",
     )
     for calm in (Stiffness(1.0, 0.0, 6), Stiffness(None, None, 0)):
         assert not calm.stiff
-        assert _words(calm) == ()
+        assert calm.events() == ()
