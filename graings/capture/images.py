@@ -1,7 +1,8 @@
 """ImageStore: pixels of frames, decoded when asked for, kept in a bounded cache.
 
-Decode, undistort, shrink by exact area average on premultiplied alpha, composite on the background. Knows nothing of
-splits, poses or training.
+Decode, undistort, shrink by exact area average on premultiplied alpha, composite on the background. Kept as 16-bit
+numbers, half the memory of float32; rounding costs at most 0.002 levels of 255, and nothing where a file's own pixels
+are shown. Knows nothing of splits, poses or training.
 """
 
 from __future__ import annotations
@@ -20,24 +21,24 @@ from graings.capture.image_file import decode
 from graings.errors import CaptureError
 
 Image = NDArray[np.float32]
+Kept = NDArray[np.uint16]
 Picture = tuple[Path, int, int]
 Key = tuple[Path, int, int, str]
 
 
 class ImageStore:
-    """Images of a capture on one background; safe to share between threads.
-
-    Returned arrays are those in the cache: read them, do not write.
-    """
+    """Images of a capture on one background; safe to share between threads."""
 
     def __init__(self, background: Sequence[float], cache_mb: int = 1024) -> None:
         self._background = np.asarray(background, dtype=np.float32).reshape(3)
+        self._kept_background = _kept(self._background)
+        self._between_steps = bool((_shown(self._kept_background) != self._background).any())
         self._limit = cache_mb * 1_000_000
         self._lock = threading.Lock()
-        self._cache: OrderedDict[Key, Image | None] = OrderedDict()
+        self._cache: OrderedDict[Key, Kept | None] = OrderedDict()
         self._bytes = 0
         self._ahead = ThreadPoolExecutor(1, "decoder")
-        self._coming: dict[Picture, Future[tuple[Image, Image | None]]] = {}
+        self._coming: dict[Picture, Future[tuple[Kept, Kept | None]]] = {}
 
     def prefetch(self, frame: Frame) -> None:
         """Begin to decode a frame that is wanted next, on another thread; who asks for it is told what went wrong."""
@@ -47,24 +48,28 @@ class ImageStore:
                 self._coming[picture] = self._ahead.submit(self._load, frame)
 
     def rgb(self, frame: Frame) -> Image:
-        """Colour [H, W, 3] in [0, 1] on the background, at the size of the frame's camera.
+        """Colour [H, W, 3] in [0, 1] on the background, at the size of the frame's camera, in steps of 1/65535.
 
         Raises `CaptureError` where the file has changed or broken since the capture was loaded.
         """
-        image = self._get(frame, "rgb")
-        assert image is not None  # only alpha may be absent
+        kept = self._get(frame, "rgb")
+        assert kept is not None  # only alpha may be absent
+        image = _shown(kept)
+        if self._between_steps:  # nothing in sight has the very colour of a render in which nothing is drawn
+            np.copyto(image, self._background, where=kept == self._kept_background)
         return image
 
     def alpha(self, frame: Frame) -> Image | None:
         """Coverage [H, W] in [0, 1] at the size of the frame's camera; None where the file has no alpha channel."""
-        return self._get(frame, "alpha")
+        kept = self._get(frame, "alpha")
+        return None if kept is None else _shown(kept)
 
     @property
     def cached_bytes(self) -> int:
         """Memory the cached arrays take."""
         return self._bytes
 
-    def _get(self, frame: Frame, part: str) -> Image | None:
+    def _get(self, frame: Frame, part: str) -> Kept | None:
         picture = _picture(frame)
         key = (*picture, part)
         with self._lock:
@@ -79,7 +84,7 @@ class ImageStore:
             self._keep((*picture, "rgb"), rgb)
         return rgb if part == "rgb" else alpha
 
-    def _keep(self, key: Key, image: Image | None) -> None:
+    def _keep(self, key: Key, image: Kept | None) -> None:
         if key in self._cache:
             return
         self._cache[key] = image
@@ -88,7 +93,7 @@ class ImageStore:
             _, dropped = self._cache.popitem(last=False)
             self._bytes -= 0 if dropped is None else dropped.nbytes
 
-    def _load(self, frame: Frame) -> tuple[Image, Image | None]:
+    def _load(self, frame: Frame) -> tuple[Kept, Kept | None]:
         pixels = decode(frame.image_path, frame.name)
         if (pixels.shape[1], pixels.shape[0]) != frame.source_size:
             raise CaptureError(
@@ -101,10 +106,21 @@ class ImageStore:
             pixels = frame.lens.undistort(pixels)
         pixels = shrink(pixels, frame.camera.width, frame.camera.height)
         if pixels.shape[2] == 3:
-            return np.ascontiguousarray(pixels), None
-        alpha = np.ascontiguousarray(pixels[..., 3])
+            return _kept(pixels), None
+        alpha = pixels[..., 3]
         rgb = pixels[..., :3] + self._background * (1.0 - alpha)[..., None]
-        return np.minimum(rgb, np.float32(1.0)), alpha
+        return _kept(np.minimum(rgb, np.float32(1.0))), _kept(alpha)
+
+
+STEPS = np.float32(65535)  # from 0 to 1
+
+
+def _kept(image: Image) -> Kept:
+    return np.ascontiguousarray(np.rint(image * STEPS).astype(np.uint16))
+
+
+def _shown(kept: Kept) -> Image:
+    return np.divide(kept, STEPS, dtype=np.float32)
 
 
 def _picture(frame: Frame) -> Picture:
