@@ -208,13 +208,6 @@ class TrainConfig(Part):
     time_window_until: int = Field(
         7_500, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."
     )
-    hard_views: float = Field(
-        0.3,
-        ge=0,
-        le=1,
-        description="Share of the training views that come twice in each pass: those with the largest error when last "
-        "seen. 0: all views alike.",
-    )
     matrix_step: Literal["muon", "adam"] = Field(
         "muon",
         description="How weight matrices of StaticMLP and DeformNet step. muon: orthogonalised momentum; adam: as the "

@@ -36,31 +36,19 @@ class Streams:
 
 
 class ViewSampler:
-    """Training views in passes: every view once, the hard ones twice, in a new random order each time.
+    """Training views without replacement: every view once, in a new random order each round."""
 
-    Hard is the share `hard` of the views seen so far whose error was largest when they were last seen.
-    """
-
-    def __init__(self, count: int, generator: torch.Generator, hard: float = 0.0) -> None:
+    def __init__(self, count: int, generator: torch.Generator) -> None:
         if count < 1:
             raise ValueError(f"count must be at least 1, got {count}")
         self.count = count
         self.generator = generator
-        self.hard = hard
         self.remaining = torch.empty(0, dtype=torch.int64)
-        self.errors = torch.zeros(count)  # 0: not seen yet, or nothing to learn from
 
     def next(self) -> int:
         """Index of the next view."""
         if len(self.remaining) == 0:
-            order = torch.argsort(self.errors, descending=True, stable=True)
-            hard = order[: int(self.hard * self.errors.count_nonzero())]
-            views = torch.cat([torch.arange(self.count), hard])
-            self.remaining = views[torch.randperm(len(views), generator=self.generator)]
+            self.remaining = torch.randperm(self.count, generator=self.generator)
         index = int(self.remaining[0])
         self.remaining = self.remaining[1:]
         return index
-
-    def observe(self, view: int, error: float) -> None:
-        """Note how far `view` is from its image: any measure, the same for all views."""
-        self.errors[view] = error

@@ -88,7 +88,7 @@ class Trainer:
         self.background = config.capture.background_rgb()
         self.phases = phases(config)
         self.streams = Streams(config.seed)
-        self.sampler = ViewSampler(len(capture.train), self.streams["sampler"], config.hard_views)
+        self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
         self.times = capture.times
         self.iteration = 0
         start = make_scene(capture, images, config, self.streams)
@@ -122,8 +122,7 @@ class Trainer:
         self.iteration += 1
         phase = self.phase(self.iteration)
         self.scene.temporal = phase.temporal
-        view = self._next_view()
-        frame = self.capture.train[view]
+        frame = self._next_frame()
         target = torch.from_numpy(self.images.rgb(frame))
         if (upcoming := self._upcoming()) is not None:
             self.images.prefetch(self.capture.train[upcoming])
@@ -141,7 +140,6 @@ class Trainer:
         gradients = self.optimizer.gradients()
         if offset.grad is not None:
             gradients.append(Gradient("the projected centres", SCREEN, offset.grad))
-        mse = float(functional.mse_loss(result.color.detach(), target))
         verdict = self.guard.judge(self.iteration, loss.detach(), gradients)
         if verdict.culprit is None:
             for group, (norm, limit) in verdict.limits.items():
@@ -159,7 +157,6 @@ class Trainer:
                     (frame.camera.width, frame.camera.height),
                 )
             self.optimizer.step(self.iteration)
-            self.sampler.observe(view, mse)
             if self.iteration % self.config.guard.check_every == 0 or self.iteration == self.config.iterations:
                 self._measure(composition, frame)
         else:
@@ -168,6 +165,7 @@ class Trainer:
         events += self._adapt()
         events += self._watch(len(composition.children), float(loss.detach()))
         self._settle()
+        mse = float(functional.mse_loss(result.color.detach(), target))
         return StepReport(
             iteration=self.iteration,
             iterations=self.config.iterations,
@@ -193,12 +191,12 @@ class Trainer:
             return []
         return [f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens"]
 
-    def _next_view(self) -> int:
+    def _next_frame(self) -> Frame:
         """The next view that takes part by now."""
         view = self.sampler.next()
         while not self.window.has(view, self.iteration):
             view = self.sampler.next()
-        return view
+        return self.capture.train[view]
 
     def _upcoming(self) -> int | None:
         """The view that comes next in this pass, or None at its end."""
@@ -299,8 +297,7 @@ class Trainer:
     def _sampler(self) -> ViewSampler:
         """Views in the order of this attempt: the one that failed is not repeated."""
         attempt = self.guard.rollbacks
-        name = f"sampler.{attempt}" if attempt else "sampler"
-        return ViewSampler(len(self.capture.train), self.streams[name], self.config.hard_views)
+        return ViewSampler(len(self.capture.train), self.streams[f"sampler.{attempt}" if attempt else "sampler"])
 
     def restore(self) -> None:
         """Return to the newest good moment, and its iteration, for good: the guard has given up.
@@ -323,7 +320,7 @@ class Trainer:
         statistics, growth = self.density.state()
         tensors |= {f"statistics/{name}": value for name, value in statistics.items()}
         tensors |= {f"streams/{name}": value for name, value in self.streams.state().items()}
-        tensors |= {"sampler/remaining": self.sampler.remaining, "sampler/errors": self.sampler.errors.clone()}
+        tensors["sampler/remaining"] = self.sampler.remaining
         means, average = self.average.state()
         tensors |= {f"average/{name}": value for name, value in means.items()}
         norms, guard = self.guard.state()
@@ -358,6 +355,4 @@ class Trainer:
         self._slow_down()
         self.sampler = self._sampler()
         self.sampler.remaining = parts["sampler"]["remaining"].clone()
-        if "errors" in parts["sampler"]:  # older ones took all views alike
-            self.sampler.errors = parts["sampler"]["errors"].clone()
         self.iteration = int(facts["iteration"])

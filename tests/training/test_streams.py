@@ -29,31 +29,3 @@ def test_every_view_is_drawn_once_per_round_in_a_new_order() -> None:
     rounds = [[sampler.next() for _ in range(7)] for _ in range(3)]
     assert all(sorted(order) == list(range(7)) for order in rounds)
     assert rounds[0] != rounds[1]
-
-
-def test_hard_views_come_twice_until_they_are_no_longer_the_hardest() -> None:
-    sampler = ViewSampler(10, Streams(0)["sampler"], hard=0.3)
-
-    def a_pass() -> list[int]:
-        views = [sampler.next()]
-        while len(sampler.remaining):
-            views.append(sampler.next())
-        return views
-
-    assert sorted(a_pass()) == list(range(10))  # nothing is known yet
-    for view in range(10):
-        sampler.observe(view, 0.1 * (view + 1))
-    second, third = a_pass(), a_pass()
-    assert sorted(second) == sorted(third) == sorted([*range(10), 7, 8, 9])
-    assert second != third
-    sampler.observe(9, 0.01)
-    assert sorted(a_pass()) == sorted([*range(10), 6, 7, 8])
-
-
-def test_views_not_seen_yet_are_not_hard() -> None:
-    sampler = ViewSampler(10, Streams(0)["sampler"], hard=0.5)
-    for view in (2, 5, 6, 8):
-        sampler.observe(view, float(view))
-    drawn = [sampler.next() for _ in range(12)]
-    assert len(sampler.remaining) == 0
-    assert sorted(drawn) == sorted([*range(10), 6, 8])
