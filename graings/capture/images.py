@@ -1,8 +1,8 @@
 """ImageStore: pixels of frames, decoded when asked for, kept in a bounded cache.
 
 Decode, undistort, shrink by exact area average on premultiplied alpha, composite on the background. Kept as 16-bit
-numbers, half the memory of float32; rounding costs at most 0.002 levels of 255, and nothing where a file's own pixels
-are shown. Knows nothing of splits, poses or training.
+numbers, half the memory of float32; rounding costs at most 0.002 levels of 255, and nothing for opaque pixels of 8 or
+16 bits at their own size. Knows nothing of splits, poses or training.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ Image = NDArray[np.float32]
 Kept = NDArray[np.uint16]
 Picture = tuple[Path, int, int]
 Key = tuple[Path, int, int, str]
+
+STEPS: Final = np.float32(65535)  # of what is kept, from 0 to 1
 
 
 class ImageStore:
@@ -110,9 +113,6 @@ class ImageStore:
         alpha = pixels[..., 3]
         rgb = pixels[..., :3] + self._background * (1.0 - alpha)[..., None]
         return _kept(np.minimum(rgb, np.float32(1.0))), _kept(alpha)
-
-
-STEPS = np.float32(65535)  # from 0 to 1
 
 
 def _kept(image: Image) -> Kept:
