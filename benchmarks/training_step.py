@@ -1,6 +1,6 @@
 """Where one training step goes: milliseconds per part, on a run folder that has a checkpoint.
 
-    python benchmarks/training_step.py RUN [--steps 50] [--threads 2]
+    python benchmarks/training_step.py RUN [--steps 50] [--threads 2] [--batch 1]
 
 Continues the run in memory (nothing is written) and measures each part of a step apart; the parts are timed
 in the order of a real step, and the last line compares their sum with the unbroken `Trainer.step`.
@@ -25,10 +25,11 @@ from graings.training.trainer import Trainer
 
 
 class Stopwatch:
-    """Milliseconds by name, one list entry per step."""
+    """Milliseconds by name, one list entry per step; laps of the same name within a step add up."""
 
     def __init__(self) -> None:
         self.parts: dict[str, list[float]] = defaultdict(list)
+        self._step: dict[str, float] = defaultdict(float)
         self._last = time.perf_counter()
 
     def start(self) -> None:
@@ -36,47 +37,63 @@ class Stopwatch:
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
-        self.parts[name].append(1e3 * (now - self._last))
+        self._step[name] += 1e3 * (now - self._last)
         self._last = now
+
+    def close(self) -> None:
+        """The step has ended."""
+        for name, milliseconds in self._step.items():
+            self.parts[name].append(milliseconds)
+        self._step.clear()
 
 
 def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     """One step taken apart; returns the number of Gaussians drawn."""
     trainer.iteration += 1
     trainer.scene.temporal = trainer.phase(trainer.iteration).temporal
-    frame = trainer.capture.train[trainer.sampler.next()]
+    frames = trainer.next_frames()
     watch.start()
-    target = torch.from_numpy(trainer.images.rgb(frame))
-    watch.lap("image")
-    composition = trainer.scene.compose(frame.camera.center, frame.time)
+    targets = [torch.from_numpy(trainer.images.rgb(frame)) for frame in frames]
+    watch.lap("images")
+    compositions = trainer.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
     watch.lap("scene forward")
-    gaussians = composition.gaussians
-    offset = torch.zeros(len(gaussians), 2, requires_grad=True)
-    result = draw(composition, frame.camera, trainer.background, means2d_offset=offset)
-    watch.lap("raster forward")
-    image = result.color.detach().requires_grad_()
-    photometric(image, target, trainer.config.loss.ssim).backward()
-    watch.lap("photometric loss, forward + backward")
-    leaves = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacities, gaussians.colors, offset]
-    grads = torch.autograd.grad(result.color, leaves, image.grad)
-    watch.lap("raster backward")
-    regulariser = trainer.regularisers(composition, frame.time)
+    leaves, grads, screen = [], [], []
+    for frame, target, composition in zip(frames, targets, compositions, strict=True):
+        gaussians = composition.gaussians
+        watch.start()
+        offset = torch.zeros(len(gaussians), 2, requires_grad=True)
+        result = draw(composition, frame.camera, trainer.background, means2d_offset=offset)
+        watch.lap("raster forward")
+        image = result.color.detach().requires_grad_()
+        (photometric(image, target, trainer.config.loss.ssim) / len(frames)).backward()
+        watch.lap("photometric loss, forward + backward")
+        own = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacities, gaussians.colors]
+        *gradients, at_centres = torch.autograd.grad(result.color, [*own, offset], image.grad)
+        watch.lap("raster backward")
+        leaves += own
+        grads += gradients
+        screen.append((at_centres, result.radii.amax(-1) > 0))
+    regulariser = trainer.regularisers(compositions, [frame.time for frame in frames])
     watch.lap("regularisers forward (a second time of DeformNet)")
     torch.autograd.backward(
-        [*leaves[:-1], *([regulariser] if regulariser.requires_grad else [])],
-        [*grads[:-1], *([torch.ones(())] if regulariser.requires_grad else [])],
+        [*leaves, *([regulariser] if regulariser.requires_grad else [])],
+        [*grads, *([torch.ones(())] if regulariser.requires_grad else [])],
     )
     watch.lap("scene backward")
-    gradients = [*trainer.optimizer.gradients(), Gradient("the projected centres", "screen", grads[-1])]
-    trainer.guard.judge(trainer.iteration, regulariser.detach(), gradients)
+    judged = trainer.optimizer.gradients()
+    judged += [Gradient("the projected centres", "screen", at_centres) for at_centres, _ in screen]
+    trainer.guard.judge(trainer.iteration, regulariser.detach(), judged)
     watch.lap("guard")
-    size = (frame.camera.width, frame.camera.height)
-    visible = result.radii.amax(-1) > 0
-    trainer.density.statistics.observe(composition.children, grads[-1], visible, composition.opacities, size)
+    for frame, composition, (at_centres, visible) in zip(frames, compositions, screen, strict=True):
+        size = (frame.camera.width, frame.camera.height)
+        trainer.density.statistics.observe(
+            composition.children, at_centres * len(frames), visible, composition.opacities, size
+        )
     watch.lap("growth statistics")
     trainer.optimizer.step(trainer.iteration)
     watch.lap("optimizer")
-    return len(gaussians)
+    watch.close()
+    return len(compositions[0].children)
 
 
 def main() -> None:
@@ -84,9 +101,12 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--threads", type=int, default=None)
+    parser.add_argument("--batch", type=int, default=None, help="views per step; left out: as the run has it")
     arguments = parser.parse_args()
     run = TrainingRun.resume(arguments.run, threads=arguments.threads)
     trainer = run._trainer
+    if arguments.batch is not None:
+        trainer.config = trainer.config.model_copy(update={"batch": arguments.batch})
     trainer.iteration = min(trainer.iteration, run.iterations - 2 * arguments.steps - 10)
     for _ in range(5):
         trainer.step()
@@ -100,7 +120,8 @@ def main() -> None:
     camera = run.capture.train[0].camera
     print(
         f"{camera.width}x{camera.height} px, iteration {trainer.iteration}, {statistics.median(counts):.0f} drawn, "
-        f"{trainer.scene.scaffold.count} anchors, {kernel.threads()} threads, median of {arguments.steps} steps"
+        f"{trainer.scene.scaffold.count} anchors, "
+        f"{trainer.config.batch} views a step, {kernel.threads()} threads, median of {arguments.steps} steps"
     )
     total = 0.0
     for name, values in watch.parts.items():

@@ -191,6 +191,13 @@ class TrainConfig(Part):
 
     preset: Literal["draft", "standard", "paper"] = Field("standard", description="Where the defaults come from.")
     iterations: int = Field(15_000, ge=1, le=1_000_000, description="Optimisation steps.")
+    batch: int = Field(
+        1,
+        ge=1,
+        le=64,
+        description="Views per optimisation step, each at its own instant. What networks say of all instants alike is "
+        "computed once a step, and rates rise by the cube root.",
+    )
     warmup: int = Field(1_000, ge=0, description="Static warm-up T_w, of the 30 000 schedule; the paper has 3 000.")
     average_from: int = Field(
         29_000,

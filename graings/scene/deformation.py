@@ -58,16 +58,25 @@ class DeformationNetwork(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, positions: Float[Tensor, "gaussian 3"], time: Float[Tensor, 1]) -> Float[Tensor, "gaussian 10"]:
-        """`positions` in units of the scene's extent, `time` in [0, 1]."""
+    def forward(
+        self, positions: Float[Tensor, "gaussian 3"], times: Float[Tensor, "time 1"]
+    ) -> Float[Tensor, "time gaussian 10"]:
+        """`positions` in units of the scene's extent, `times` in [0, 1].
+
+        In a product a further time is ten further outputs: the hidden layers run once.
+        """
         encoded = frequency_encoding(positions, self.position_frequencies)
-        moment = frequency_encoding(time, self.time_frequencies)
+        moments = frequency_encoding(times, self.time_frequencies)
         weights, biases = weights_and_biases([self.from_position, *self.hidden, self.out])
-        if self.from_time is not None:
-            biases[0] = biases[0] + self.from_time(moment)
         if self.psi is not None:
-            weights[-1] = weights[-1] * self.psi(moment)
-        return perceptron(encoded, weights, biases)
+            weights[-1] = (weights[-1] * self.psi(moments).unsqueeze(1)).flatten(0, 1)
+            biases[-1] = biases[-1].repeat(len(times))
+            return perceptron(encoded, weights, biases).unflatten(1, (len(times), -1)).transpose(0, 1)
+        assert self.from_time is not None
+        first, *others = biases
+        return torch.stack(
+            [perceptron(encoded, weights, [first + shift, *others]) for shift in self.from_time(moments)]
+        )
 
 
 def time_modules(config: SceneConfig) -> tuple[nn.Linear | None, nn.Sequential | None]:

@@ -7,6 +7,7 @@ or losses.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,41 +84,66 @@ class Scene(nn.Module):
 
     def compose(self, eye: ArrayLike, time: float) -> Composition:
         """As `gaussians`, with the intermediate quantities of training."""
+        return self.compose_together([(eye, time)])[0]
+
+    def compose_together(self, views: Sequence[tuple[ArrayLike, float]]) -> list[Composition]:
+        """As `compose` for several views (eye, time), which share their children: those drawn in any of them.
+
+        A child that one view would have left out has no opacity to speak of there, so no picture changes; and what does
+        not depend on the view, most of the networks' work, is done once.
+        """
         scaffold, config = self.scaffold, self.config
-        dtype = scaffold.features.dtype
         features = scaffold.features
-        moment = torch.tensor([time], dtype=dtype)
-        directions = self.directions(eye)
+        moments = [torch.tensor([time], dtype=features.dtype) for _, time in views]
+        directions = [self.directions(eye) for eye, _ in views]
 
-        scores = tanh(self.appearance.opacity_logits(features, directions) + scaffold.opacity_offsets.unsqueeze(-1))
-        change: Tensor | None = None
         residual = self.residual if self.temporal else None
-        if residual is not None:
-            source = features.detach() if config.residual_stop_gradient else features
-            change = residual(source, moment)
-            scores = scores + residual.bounded(change[..., 3])
-
-        children = (scores.detach().flatten() > constants.ALPHA_MIN).nonzero().squeeze(-1)
-        colors = self.appearance.colors(features, directions, children)
-        drawn_change = None
-        if residual is not None and change is not None:
-            drawn_change = residual.bounded(change.flatten(0, 1).index_select(0, children))
-            colors = clip(colors + drawn_change[:, :3], 0.0, 1.0, projected=config.projected_clip)
+        scores, changes = self._scores(residual, directions, moments)
+        drawn_anywhere = torch.stack([score.detach() for score in scores]).amax(0).flatten() > constants.ALPHA_MIN
+        children = drawn_anywhere.nonzero().squeeze(-1)
 
         drawn = gather(scaffold, children)
-        canonical, raw = self._answers(drawn, children, time)
+        uids = scaffold.child_uids(children)
         extent = float(self.extent)
-        means, quats, log_scales = compose(canonical, drawn, raw, extent, projected_clip=config.projected_clip)
-        gaussians = Gaussians(
-            means=means,
-            quats=quats,
-            log_scales=log_scales,
-            opacities=scores.flatten().index_select(0, children),
-            colors=colors,
-            uids=scaffold.child_uids(children),
-        )
-        moved = None if raw is None else deformation_from(raw, extent)
-        return Composition(gaussians, children, drawn.centres, moved, drawn_change, scores.detach())
+        compositions = []
+        answers = self._answers(drawn, children, [time for _, time in views])
+        for score, change, towards, (canonical, raw) in zip(scores, changes, directions, answers, strict=True):
+            colors = self.appearance.colors(features, towards, children)
+            drawn_change = None
+            if residual is not None and change is not None:
+                drawn_change = residual.bounded(change.flatten(0, 1).index_select(0, children))
+                colors = clip(colors + drawn_change[:, :3], 0.0, 1.0, projected=config.projected_clip)
+            means, quats, log_scales = compose(canonical, drawn, raw, extent, projected_clip=config.projected_clip)
+            gaussians = Gaussians(
+                means=means,
+                quats=quats,
+                log_scales=log_scales,
+                opacities=score.flatten().index_select(0, children),
+                colors=colors,
+                uids=uids,
+            )
+            moved = None if raw is None else deformation_from(raw, extent)
+            compositions.append(Composition(gaussians, children, drawn.centres, moved, drawn_change, score.detach()))
+        return compositions
+
+    def _scores(
+        self, residual: ResidualField | None, directions: Sequence[Tensor], moments: Sequence[Tensor]
+    ) -> tuple[list[Tensor], list[Tensor | None]]:
+        """Of each view: the opacity score [A, k] of every slot, and the residual field's answer, if it is asked."""
+        scaffold, config = self.scaffold, self.config
+        offsets = scaffold.opacity_offsets.unsqueeze(-1)
+        features = scaffold.features
+        source = features.detach() if config.residual_stop_gradient else features
+        lasting: Tensor | None = None
+        scores: list[Tensor] = []
+        changes: list[Tensor | None] = []
+        for towards, moment in zip(directions, moments, strict=True):
+            if lasting is None or config.opacity_view:
+                lasting = tanh(self.appearance.opacity_logits(features, towards) + offsets)
+            change = None if residual is None else residual(source, moment)
+            changes.append(change)
+            scores.append(lasting if residual is None or change is None else lasting + residual.bounded(change[..., 3]))
+        return scores, changes
 
     def directions(self, eye: ArrayLike) -> Float[Tensor, "anchor 3"]:
         """Unit vectors from the camera centre to every anchor (decision A21)."""
@@ -137,28 +163,30 @@ class Scene(nn.Module):
         if self.single is not None:
             raw = self._single(self.single, gather(self.scaffold, children), canonical_means, time)[:, 7:]
         else:
-            raw = self._moved(children, canonical_means, time)
+            raw = self._moved(children, canonical_means, [time])[0]
         return deformation_from(raw, float(self.extent))
 
-    def _answers(self, drawn: Children, children: Tensor, time: float) -> tuple[Tensor, Tensor | None]:
-        """What the networks say of the drawn children: canonical geometry, and its change unless nothing moves."""
+    def _answers(self, drawn: Children, children: Tensor, times: Sequence[float]) -> list[tuple[Tensor, Tensor | None]]:
+        """What the networks say of the drawn children at each time: canonical geometry, and its change if it moves."""
         if self.single is not None:
-            raw = self._single(self.single, drawn, drawn.centres, time if self.temporal else None)
-            return raw[:, :7], raw[:, 7:] if self.temporal else None
+            if not self.temporal:
+                return [(self._single(self.single, drawn, drawn.centres, None)[:, :7], None)] * len(times)
+            every = [self._single(self.single, drawn, drawn.centres, time) for time in times]
+            return [(raw[:, :7], raw[:, 7:]) for raw in every]
         canonical = unlearned(drawn.centres) if self.static is None else self.static(self.scaffold.features, drawn)
-        moves = self.temporal and self.deformation is not None
-        return canonical, self._moved(children, drawn.centres, time) if moves else None
+        if not self.temporal or self.deformation is None:
+            return [(canonical, None)] * len(times)
+        return [(canonical, raw) for raw in self._moved(children, drawn.centres, times)]
 
-    def _moved(self, children: Tensor, canonical_means: Tensor, time: float) -> Tensor:
-        """DeformNet's answer per child, or one per anchor that all its children share."""
+    def _moved(self, children: Tensor, canonical_means: Tensor, times: Sequence[float]) -> list[Tensor]:
+        """DeformNet's answer per child at each time, or one per anchor that all its children share."""
         assert self.deformation is not None
-        moment = torch.tensor([time], dtype=canonical_means.dtype)
+        moments = torch.tensor(times, dtype=canonical_means.dtype).unsqueeze(-1)
         if self.config.deformation == "anchor":
             used, place = torch.unique(children // self.scaffold.slots, return_inverse=True)
-            shared: Tensor = self.deformation(self.scaffold.anchors.index_select(0, used) / self.extent, moment)
-            return shared.index_select(0, place)
-        own: Tensor = self.deformation(self._positions(canonical_means), moment)
-        return own
+            shared = self.deformation(self.scaffold.anchors.index_select(0, used) / self.extent, moments)
+            return [raw.index_select(0, place) for raw in shared.unbind(0)]
+        return list(self.deformation(self._positions(canonical_means), moments).unbind(0))
 
     def _single(self, single: SingleMLP, drawn: Children, canonical_means: Tensor, time: float | None) -> Tensor:
         moment = None if time is None else torch.tensor([time], dtype=canonical_means.dtype)

@@ -1,10 +1,12 @@
-"""Regularisers: the terms of Eq. 14 on the model itself, weighted, for one composed frame.
+"""Regularisers: the terms of Eq. 14 on the model itself, weighted, for the views of one step.
 
 Chooses the pair of times and the sample of children that the temporal term compares. Knows nothing of images,
 schedules or optimisers.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -22,26 +24,29 @@ MIN_TEMPORAL_SAMPLE = 2_000
 
 def regularisers(
     scene: Scene,
-    composition: Composition,
-    time: float,
+    compositions: Sequence[Composition],
+    moments: Sequence[float],
     times: NDArray[np.float64],
     config: LossConfig,
     generator: torch.Generator,
 ) -> Float[Tensor, ""]:
-    """lambda_1 L_temp + lambda_2 L_def + lambda_3 L_res of `composition` at `time`; zero in the static phase.
+    """lambda_1 L_temp + lambda_2 L_def + lambda_3 L_res of one step's `compositions`; zero in the static phase.
 
-    `times` are the capture's training times, ascending; `generator` draws the neighbouring time and the sample.
+    They were composed together at `moments`, of which the first also gives L_temp its pair of times: one per step
+    (decision 10). `times` are the capture's training times, ascending; `generator` draws the neighbour and the sample.
     """
     total = torch.zeros(())
-    moved = composition.deformation
-    if moved is not None and len(composition.children) > 0:
-        if config.l_def:
-            total = total + config.gain * config.deformation * losses.deformation(moved)
-        if config.l_temp and len(times) > 1:
-            share = config.temporal_share
-            total = total + config.gain * config.temporal * _temporal(scene, composition, time, times, share, generator)
-    if composition.residual is not None and config.l_res and len(composition.children) > 0:
-        total = total + config.gain * config.residual * losses.residual(composition.residual)
+    first = compositions[0]
+    if len(first.children) == 0:
+        return total
+    if first.deformation is not None and config.l_temp and len(times) > 1:
+        share = config.temporal_share
+        total = total + config.gain * config.temporal * _temporal(scene, first, moments[0], times, share, generator)
+    for one in compositions:
+        if one.deformation is not None and config.l_def:
+            total = total + config.gain * config.deformation * losses.deformation(one.deformation) / len(compositions)
+        if one.residual is not None and config.l_res:
+            total = total + config.gain * config.residual * losses.residual(one.residual) / len(compositions)
     return total
 
 

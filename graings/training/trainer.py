@@ -6,9 +6,11 @@ Never prints, logs, saves or asks: whoever iterates decides. Knows nothing of fi
 from __future__ import annotations
 
 import copy
+import itertools
 import math
+import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -122,57 +124,64 @@ class Trainer:
         self.iteration += 1
         phase = self.phase(self.iteration)
         self.scene.temporal = phase.temporal
-        frame = self._next_frame()
-        target = torch.from_numpy(self.images.rgb(frame))
-        if (upcoming := self._upcoming()) is not None:
-            self.images.prefetch(self.capture.train[upcoming])
+        frames = self.next_frames()
+        targets = [torch.from_numpy(self.images.rgb(frame)) for frame in frames]
+        for view in self._upcoming():
+            self.images.prefetch(self.capture.train[view])
 
-        composition = self.scene.compose(frame.camera.center, frame.time)
-        offset = torch.zeros(len(composition.gaussians), 2, requires_grad=True)
-        result = draw(composition, frame.camera, self.background, means2d_offset=offset)
-        image_loss = photometric(result.color, target, self.config.loss.ssim)
-        loss = image_loss + self.regularisers(composition, frame.time)
+        compositions = self.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
+        children = compositions[0].children
+        offsets = [torch.zeros(len(children), 2, requires_grad=True) for _ in frames]
+        results = [
+            draw(composition, frame.camera, self.background, means2d_offset=offset)
+            for composition, frame, offset in zip(compositions, frames, offsets, strict=True)
+        ]
+        loss = self.regularisers(compositions, [frame.time for frame in frames])
+        for result, target in zip(results, targets, strict=True):
+            loss = loss + photometric(result.color, target, self.config.loss.ssim) / len(frames)
         # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.
         if loss.requires_grad:
             loss.backward()
 
         events = self._opening()
+        names = ", ".join(frame.name for frame in frames)
         gradients = self.optimizer.gradients()
-        if offset.grad is not None:
-            gradients.append(Gradient("the projected centres", SCREEN, offset.grad))
+        gradients += [Gradient("the projected centres", SCREEN, o.grad) for o in offsets if o.grad is not None]
         verdict = self.guard.judge(self.iteration, loss.detach(), gradients)
         if verdict.culprit is None:
             for group, (norm, limit) in verdict.limits.items():
-                events.append(f"clipped: gradients of {group} at {norm:.3g} limited to {limit:.3g} on {frame.name}")
+                events.append(f"clipped: gradients of {group} at {norm:.3g} limited to {limit:.3g} on {names}")
                 if group != SCREEN:
                     self.optimizer.limit(group, self.config.guard.clip, limit)
             # A step out of all proportion says nothing about where anchors are wanted.
-            if self.density.watches(self.iteration) and offset.grad is not None and not verdict.limits:
-                visible = result.radii.amax(-1) > 0
-                self.density.statistics.observe(
-                    composition.children,
-                    offset.grad,
-                    visible,
-                    composition.opacities,
-                    (frame.camera.width, frame.camera.height),
-                )
+            if self.density.watches(self.iteration) and not verdict.limits:
+                for frame, composition, offset, result in zip(frames, compositions, offsets, results, strict=True):
+                    if offset.grad is not None:
+                        self.density.statistics.observe(
+                            children,
+                            offset.grad * len(frames),  # of the view's own loss, not of the mean
+                            result.radii.amax(-1) > 0,
+                            composition.opacities,
+                            (frame.camera.width, frame.camera.height),
+                        )
             self.optimizer.step(self.iteration)
             if self.iteration % self.config.guard.check_every == 0 or self.iteration == self.config.iterations:
-                self._measure(composition, frame)
+                self._measure(compositions[0], frames[0])
         else:
             self.optimizer.clear()
-            events.append(f"skipped: {verdict.culprit} was not finite on {frame.name} at t = {frame.time:.4g}")
+            moments = ", ".join(f"{frame.time:.4g}" for frame in frames)
+            events.append(f"skipped: {verdict.culprit} was not finite on {names} at t = {moments}")
         events += self._adapt()
-        events += self._watch(len(composition.children), float(loss.detach()))
+        events += self._watch(len(children), float(loss.detach()))
         self._settle()
-        mse = float(functional.mse_loss(result.color.detach(), target))
+        errors = [float(functional.mse_loss(r.color.detach(), t)) for r, t in zip(results, targets, strict=True)]
         return StepReport(
             iteration=self.iteration,
             iterations=self.config.iterations,
             phase=phase.name,
             loss=float(loss.detach()),
-            psnr=-10.0 * math.log10(max(mse, 1e-10)),
-            gaussians=len(composition.gaussians),
+            psnr=statistics.mean(-10.0 * math.log10(max(mse, 1e-10)) for mse in errors),
+            gaussians=len(children),
             anchors=self.scene.scaffold.count,
             seconds=time.perf_counter() - started,
             events=tuple(events),
@@ -191,21 +200,25 @@ class Trainer:
             return []
         return [f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens"]
 
-    def _next_frame(self) -> Frame:
-        """The next view that takes part by now."""
-        view = self.sampler.next()
-        while not self.window.has(view, self.iteration):
+    def next_frames(self) -> list[Frame]:
+        """The next `batch` views that take part by now; fewer where a pass ends before."""
+        views: list[int] = []
+        while not views or (len(views) < self.config.batch and self._upcoming()):
             view = self.sampler.next()
-        return self.capture.train[view]
+            if self.window.has(view, self.iteration):
+                views.append(view)
+        return [self.capture.train[view] for view in views]
 
-    def _upcoming(self) -> int | None:
-        """The view that comes next in this pass, or None at its end."""
+    def _upcoming(self) -> list[int]:
+        """The views of the next step, as far as this pass goes; none at its end."""
         remaining = self.sampler.remaining.tolist()
-        return next((view for view in remaining if self.window.has(view, self.iteration)), None)
+        taking_part = (view for view in remaining if self.window.has(view, self.iteration))
+        return list(itertools.islice(taking_part, self.config.batch))
 
-    def regularisers(self, composition: Composition, time: float) -> Tensor:
+    def regularisers(self, compositions: Sequence[Composition], moments: Sequence[float]) -> Tensor:
         """The terms of Eq. 14 on the model itself, with this run's weights and stream of time pairs."""
-        return regularisers(self.scene, composition, time, self.times, self.config.loss, self.streams["time_pairs"])
+        generator = self.streams["time_pairs"]
+        return regularisers(self.scene, compositions, moments, self.times, self.config.loss, generator)
 
     def _adapt(self) -> list[str]:
         """Grow and prune where the schedule says so; returns what happened, in words."""
@@ -223,7 +236,7 @@ class Trainer:
         events: list[str] = []
         scaffold, every = self.scene.scaffold, self.config.guard
         problem = self.guard.problem()
-        last_of_pass = self._upcoming() is None
+        last_of_pass = not self._upcoming()
         if self.collapse.observe(drawn, scaffold.count * scaffold.slots, loss, last_of_pass=last_of_pass):
             problem = problem or self._lost()
             if problem is None and not self.collapse.mended:

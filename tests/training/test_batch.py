@@ -1,0 +1,92 @@
+"""Several views a step: every view once in a pass, the step of their mean loss, and the same after an interruption."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from graings.capture.capture import Frame
+from graings.raster.photometric import photometric
+from graings.render import draw
+from graings.training.trainer import Trainer
+from tests.training.micro import finite, micro_trainer, quality, steps
+
+
+def watched(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Names of the frames of every step from now on."""
+    taken: list[list[str]] = []
+    choose = trainer.next_frames
+
+    def noted() -> list[Frame]:
+        frames = choose()
+        taken.append([frame.name for frame in frames])
+        return frames
+
+    monkeypatch.setattr(trainer, "next_frames", noted)
+    return taken
+
+
+@pytest.mark.parametrize("batch", [1, 2, 4, 50])
+def test_a_pass_shows_every_view_once_and_no_step_reaches_into_the_next(
+    micro: Path, monkeypatch: pytest.MonkeyPatch, batch: int
+) -> None:
+    trainer = micro_trainer(micro, batch=batch, time_window=1)
+    names = {frame.name for frame in trainer.capture.train}
+    taken = watched(trainer, monkeypatch)
+    for _ in range(3):
+        taken.clear()
+        while not taken or trainer._upcoming():
+            trainer.step()
+        assert sorted(name for step in taken for name in step) == sorted(names)
+        assert len(taken) == -(-len(names) // batch)
+
+
+def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = micro_trainer(micro, batch=3, warmup=0, **{"loss.l_temp": False, "loss.l_def": False, "loss.l_res": False})
+    steps(trainer, 5)
+    before, chosen, stepped = copy.deepcopy(trainer.scene), [], {}
+    choose = trainer.next_frames
+    monkeypatch.setattr(trainer, "next_frames", lambda: chosen.extend(choose()) or list(chosen))
+    parameters = dict(trainer.scene.named_parameters())
+
+    def noted(iteration: int) -> None:
+        stepped.update({name: p.grad.clone() for name, p in parameters.items() if p.grad is not None})
+
+    monkeypatch.setattr(trainer.optimizer, "step", noted)
+    report = trainer.step()
+    losses: list[Tensor] = []
+    for frame in chosen:
+        drawn = draw(before.compose(frame.camera.center, frame.time), frame.camera, trainer.background)
+        losses.append(photometric(drawn.color, torch.from_numpy(trainer.images.rgb(frame)), 0.2))
+    assert len(losses) > 1
+    mean = torch.stack(losses).mean()
+    mean.backward()
+    assert report.loss == pytest.approx(float(mean.detach()), rel=1e-6)
+    for name, parameter in before.named_parameters():
+        if parameter.grad is not None:
+            difference = (parameter.grad - stepped[name]).norm()
+            # Sums of a few thousand float32 terms in two orders.
+            assert float(difference) <= 1e-4 * float(parameter.grad.norm()), name
+
+
+def test_it_is_the_same_after_an_interruption(micro: Path) -> None:
+    options = {"iterations": 40, "batch": 4}
+    whole, first, second = (micro_trainer(micro, **options) for _ in range(3))
+    steps(whole, 20)
+    steps(first, 9)
+    second.load(copy.deepcopy(first.scene), *first.state())
+    steps(second, 11)
+    pairs = zip(whole.scene.parameters(), second.scene.parameters(), strict=True)
+    assert all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_it_learns(micro: Path) -> None:
+    trainer = micro_trainer(micro, iterations=60, batch=3)
+    before = quality(trainer)
+    steps(trainer, 60)
+    assert finite(trainer)
+    assert quality(trainer) > before + 3
