@@ -189,10 +189,12 @@ class EvaluationConfig(Part):
 class TrainConfig(Part):
     """One training run."""
 
-    preset: Literal["draft", "standard", "paper"] = Field("standard", description="Where the defaults come from.")
-    iterations: int = Field(15_000, ge=1, le=1_000_000, description="Optimisation steps.")
+    preset: Literal["draft", "standard", "fine", "paper"] = Field(
+        "standard", description="Where the defaults come from."
+    )
+    iterations: int = Field(5_000, ge=1, le=1_000_000, description="Optimisation steps.")
     batch: int = Field(
-        1,
+        4,
         ge=1,
         le=64,
         description="Views per optimisation step, each at its own instant. What networks say of all instants alike is "
@@ -240,10 +242,13 @@ PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         # Many steps of few Gaussians: what moves is found sooner than with few steps of many.
         "iterations": 2_500,
+        "batch": 1,
         "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 1_200},
         "rates": {"offsets": (0.03, 3e-4), "matrices": (8e-3, 2e-4)},
     },
-    "standard": {"iterations": 15_000},
+    "standard": {"iterations": 5_000, "batch": 4},
+    "fine": {"iterations": 15_000, "batch": 4},
+    # As the paper trains: one view a step.
     "paper": {"iterations": PAPER_ITERATIONS},
 }
 

@@ -176,7 +176,7 @@ def test_a_missing_pose_file_is_an_input_error(run: Path, tmp_path: Path) -> Non
         (["train", "CAPTURE", "-o", "RUN", "--set", "iterations=0"], 2, "iterations"),
         (["train", "CAPTURE", "-o", "RUN", "--set", "no.such=1"], 2, "no"),
         (["train", "CAPTURE", "-o", "RUN", "--set", "iterations"], 2, "key=value"),
-        (["train", "CAPTURE", "-o", "RUN", "--preset", "best"], 2, "draft, standard, paper"),
+        (["train", "CAPTURE", "-o", "RUN", "--preset", "best"], 2, "draft, standard, fine, paper"),
         (["train", "CAPTURE", "-o", "RUN", "--resume", "--set", "seed=1"], 2, "keeps its options"),
         (["train", "-o", "RUN"], 2, "capture"),
         (["train", "ABSENT", "-o", "RUN"], 65, "absent"),
@@ -234,7 +234,7 @@ def test_options_are_listed_with_value_bounds_and_help(
 def test_options_as_json_are_the_schema(capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("options", "--json") == 0
     document = json.loads(capsys.readouterr().out)
-    assert sorted(document["presets"]) == ["draft", "paper", "standard"]
+    assert sorted(document["presets"]) == ["draft", "fine", "paper", "standard"]
     assert "iterations" in document["schema"]["properties"]
 
 

@@ -19,8 +19,8 @@ from graings.scene.scene import Scene
 from graings.training.guard import Gradient
 from graings.training.muon import Muon
 
-# Rates are those of one view a step; with more they rise by this power of their number. Steps of four views at 1.5 times
-# the rates end where four times as many steps of one view do (docs/experiments.md).
+# Rates are those of one view a step; with more they rise by this power of their number. Steps of four views at 1.5
+# times the rates end where four times as many steps of one view do (docs/experiments.md).
 BATCH_POWER = 1 / 3
 
 ADAM_EPSILON = 1e-15  # gradients of one Gaussian are tiny; the usual 1e-8 would damp them (3DGS)

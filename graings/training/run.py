@@ -96,7 +96,7 @@ class TrainingRun:
             raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
         stored = facts.get("config")
         if isinstance(stored, dict):  # what a run does not say is as it was when there was no choice
-            stored = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS, "time_window": 1.0} | stored
+            stored = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS, "time_window": 1.0, "batch": 1} | stored
         config = restored(TrainConfig, stored, folder / "run.json")
         clock = Clock()
         started = time.perf_counter()

@@ -38,6 +38,7 @@ def micro_config(**overrides: object) -> TrainConfig:
     small: dict[str, object] = {
         "iterations": 200,
         "threads": 1,
+        "batch": 1,  # who spoils one view spoils one step
         "warmup": 3_000,
         "init.points": 150,
         "scene.children": 3,

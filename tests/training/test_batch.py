@@ -46,7 +46,9 @@ def test_a_pass_shows_every_view_once_and_no_step_reaches_into_the_next(
 
 
 def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trainer = micro_trainer(micro, batch=3, warmup=0, **{"loss.l_temp": False, "loss.l_def": False, "loss.l_res": False})
+    trainer = micro_trainer(
+        micro, batch=3, warmup=0, **{"loss.l_temp": False, "loss.l_def": False, "loss.l_res": False}
+    )
     steps(trainer, 5)
     before, chosen, stepped = copy.deepcopy(trainer.scene), [], {}
     choose = trainer.next_frames

@@ -14,7 +14,7 @@ from tests.models import EYE, tiny_scene
 
 
 def test_rates_run_log_linearly_from_first_to_last() -> None:
-    config = TrainConfig(iterations=1000)
+    config = TrainConfig(iterations=1000, batch=1)
     optimizer = Optimizer(tiny_scene(), config, joint_from=100)
     first, last = config.rates.offsets
     assert optimizer.rate("offsets", 0) == pytest.approx(first)
@@ -23,10 +23,16 @@ def test_rates_run_log_linearly_from_first_to_last() -> None:
 
 
 def test_temporal_rates_start_with_the_joint_phase() -> None:
-    config = TrainConfig(iterations=1000)
+    config = TrainConfig(iterations=1000, batch=1)
     optimizer = Optimizer(tiny_scene(), config, joint_from=100)
     assert optimizer.rate("deformation", 100) == pytest.approx(config.rates.deformation[0])
     assert optimizer.rate("deformation", 550) == pytest.approx(math.sqrt(math.prod(config.rates.deformation)))
+
+
+def test_rates_rise_by_the_cube_root_of_the_views_of_a_step() -> None:
+    one, eight = (Optimizer(tiny_scene(), TrainConfig(iterations=1000, batch=n), joint_from=100) for n in (1, 8))
+    for group in ("offsets", "matrices", "color"):
+        assert eight.rate(group, 400) == pytest.approx(2 * one.rate(group, 400))
 
 
 def test_static_step_leaves_temporal_parameters_and_moments_untouched() -> None:
