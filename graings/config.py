@@ -240,9 +240,9 @@ class TrainConfig(Part):
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
-        # Many steps of few Gaussians: what moves is found sooner than with few steps of many.
-        "iterations": 2_500,
-        "batch": 1,
+        # Many views of few Gaussians: what moves is found sooner than with few views of many.
+        "iterations": 1_000,
+        "batch": 4,
         "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 1_200},
         "rates": {"offsets": (0.03, 3e-4), "matrices": (8e-3, 2e-4)},
     },

@@ -33,7 +33,7 @@ from jobs.job import JobState
 
 # A minute or so of training on two cores.
 PRESET = "draft"
-OPTIONS: dict[str, Any] = {"iterations": 2_000, "init.points": 4_000, "density.max_anchors": 800}
+OPTIONS: dict[str, Any] = {"iterations": 800, "init.points": 4_000, "density.max_anchors": 800}
 CAPTURE: dict[str, int] = {"frames": 80, "size": 128, "bodies": 3}
 
 TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
