@@ -246,7 +246,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 1_200},
         "rates": {"offsets": (0.03, 3e-4), "matrices": (8e-3, 2e-4)},
     },
-    "standard": {"iterations": 5_000, "batch": 4},
+    # Growth as often a view as with one view a step, and from the paper's threshold on.
+    "standard": {"iterations": 5_000, "batch": 4, "density": {"grow_every": 50, "gradient_threshold": 2e-4}},
     "fine": {"iterations": 15_000, "batch": 4},
     # As the paper trains: one view a step.
     "paper": {"iterations": PAPER_ITERATIONS},
