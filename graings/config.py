@@ -250,7 +250,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "standard": {"iterations": 5_000, "batch": 4, "density": {"grow_every": 50, "gradient_threshold": 2e-4}},
     "fine": {"iterations": 15_000, "batch": 4},
     # As the paper trains: one view a step.
-    "paper": {"iterations": PAPER_ITERATIONS},
+    "paper": {"iterations": PAPER_ITERATIONS, "batch": 1},
 }
 
 

@@ -234,7 +234,8 @@ def test_options_are_listed_with_value_bounds_and_help(
 def test_options_as_json_are_the_schema(capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("options", "--json") == 0
     document = json.loads(capsys.readouterr().out)
-    assert sorted(document["presets"]) == ["draft", "fine", "paper", "standard"]
+    schedules = {name: (preset["iterations"], preset["batch"]) for name, preset in document["presets"].items()}
+    assert schedules == {"draft": (1_000, 4), "standard": (5_000, 4), "fine": (15_000, 4), "paper": (30_000, 1)}
     assert "iterations" in document["schema"]["properties"]
 
 
