@@ -106,7 +106,7 @@ class Trainer:
         self.guard = Guard(self.config.guard)
         self.collapse = Collapse()
         self.average = Average()
-        self.step_over_size: float | None = None  # of the last step that was measured and not undone since
+        self.step_over_size: float | None = None  # of the last step that was measured and stands
 
     def __iter__(self) -> Iterator[StepReport]:
         while self.iteration < self.config.iterations:
@@ -344,6 +344,7 @@ class Trainer:
             "guard": guard,
             "collapse": self.collapse.state(),
             "average": average,
+            "step_over_size": self.step_over_size,
         }
         return tensors, facts
 
@@ -365,6 +366,7 @@ class Trainer:
             self.collapse.load(facts["collapse"])
         if "average" in facts:  # older ones did not average either
             self.average.load(parts["average"], facts["average"])
+        self.step_over_size = facts.get("step_over_size")
         self._slow_down()
         self.sampler = self._sampler()
         self.sampler.remaining = parts["sampler"]["remaining"].clone()

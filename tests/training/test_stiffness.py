@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from dataclasses import replace
@@ -57,13 +58,24 @@ def test_what_is_lost_has_no_length() -> None:
 def test_a_step_that_was_undone_is_not_told_of(micro: Path) -> None:
     """Metrics hold finite numbers only: a lost scene is measured, found, and forgotten with the step."""
     trainer = micro_trainer(micro, **{"guard.check_every": 5})
-    steps(trainer, 29)
-    assert trainer.step_over_size is not None
+    steps(trainer, 34)
+    good = trainer.snapshots.newest.facts["step_over_size"]
+    assert trainer.step_over_size != good
     with torch.no_grad():
         trainer.scene.scaffold.offsets[0] = math.inf
     report = trainer.step()
     assert said([report], "rolled back")
-    assert trainer.step_over_size is None
+    assert trainer.step_over_size == good
+
+
+def test_a_run_that_goes_on_knows_how_long_its_last_steps_were(micro: Path) -> None:
+    """A point of the curve soon after a checkpoint says so too, measured or not since."""
+    first = micro_trainer(micro, **{"guard.check_every": 5})
+    steps(first, 7)
+    assert first.step_over_size is not None
+    second = micro_trainer(micro)
+    second.load(copy.deepcopy(first.scene), *first.state())
+    assert second.step_over_size == first.step_over_size
 
 
 def test_what_is_thinner_than_a_pixel_is_as_wide_as_the_low_pass() -> None:
