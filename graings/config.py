@@ -183,7 +183,7 @@ class EvaluationConfig(Part):
     first: int = Field(50, ge=1, description="Iteration of the first evaluation.")
     factor: float = Field(1.5, gt=1, description="Each evaluation comes this many times later than the last.")
     views: int = Field(8, ge=1, description="Held-out views per evaluation during training (all at the end).")
-    checkpoint_every: int = Field(1_000, ge=1, description="Iterations between checkpoints.")
+    checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")
 
 
 class TrainConfig(Part):
@@ -244,6 +244,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "iterations": 1_000,
         "batch": 4,
         "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 1_200},
+        "evaluation": {"checkpoint_every": 250},  # a look at what there is by then, half a minute from the start
         "rates": {"offsets": (0.03, 3e-4), "matrices": (8e-3, 2e-4)},
     },
     # Growth as often a view as with one view a step, and from the paper's threshold on.

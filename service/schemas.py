@@ -18,8 +18,8 @@ class ProgressResource(BaseModel):
     iterations: int
     attempt: int
     loss: float | None = None
-    psnr: float | None = Field(None, description="Of the last training view, in dB.")
-    gaussians: int | None = Field(None, description="Gaussians drawn in the last view.")
+    psnr: float | None = Field(None, description="Mean of the training views of the last step, in dB.")
+    gaussians: int | None = Field(None, description="Gaussians drawn in any view of the last step.")
     anchors: int | None = None
     iterations_per_s: float | None = None
     eta_s: float | None = Field(None, description="Seconds of training left at this speed.")

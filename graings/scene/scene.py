@@ -31,7 +31,10 @@ from graings.seeds import global_stream
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Composition:
-    """The drawn children of one instant, with everything the losses and the growth statistics look at."""
+    """What is drawn at one instant, with everything the losses and the growth statistics look at.
+
+    Children that another view composed together with this one draws are among them.
+    """
 
     gaussians: Gaussians
     children: Int64[Tensor, " gaussian"]  # flat slot (anchor * k + child) of each Gaussian

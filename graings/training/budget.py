@@ -18,15 +18,16 @@ MEGABYTE: Final = 1_000_000
 # A parameter comes with its gradient, two moments and its mean; two snapshots keep all but the gradient twice more.
 COPIES: Final = 5 + 2 * 4
 
-# Means, quaternions, scales, opacity, colour, deformation and residual of one child, and what the rasterizer keeps.
+# Means, quaternions, scales, opacity, colour, deformation and residual of one child in one view, and what the
+# rasterizer keeps.
 CHILD_FLOATS: Final = 64
 
 # Values and their gradients.
 BOTH_WAYS: Final = 2
 
 
-def bytes_per_anchor(config: SceneConfig) -> int:
-    """Memory of one more anchor whose children are all drawn."""
+def bytes_per_anchor(config: SceneConfig, views: int) -> int:
+    """Memory of one more anchor whose children are all drawn, with so many views a step."""
     k = config.children
     rows = 3 + config.feature_dim + 3 * k + 1
     statistics = 16 * k + 16
@@ -35,10 +36,13 @@ def bytes_per_anchor(config: SceneConfig) -> int:
     static = 3 + k + config.static_width
     deform = encoding_width(3, config.position_frequencies) + config.deform_width * config.deform_depth
     heads = (config.feature_dim + 3) + 3 * config.head_width + 8 * k + config.static_width
-    activations = BOTH_WAYS * FLOAT * (k * (static + deform + CHILD_FLOATS) + heads)
+    networks = static + deform
+    if config.single_mlp or config.deform_time == "input":  # time goes through the hidden layers
+        networks *= views
+    activations = BOTH_WAYS * FLOAT * (k * (networks + views * CHILD_FLOATS) + views * heads)
     return FLOAT * rows * COPIES + fixed + activations
 
 
-def affordable_anchors(config: SceneConfig, memory_mb: int) -> int:
+def affordable_anchors(config: SceneConfig, views: int, memory_mb: int) -> int:
     """Anchors that fit into `memory_mb`; at least 16, below which nothing can be seen."""
-    return max(16, memory_mb * MEGABYTE // bytes_per_anchor(config))
+    return max(16, memory_mb * MEGABYTE // bytes_per_anchor(config, views))

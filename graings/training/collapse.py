@@ -16,20 +16,20 @@ from torch import Tensor, nn
 
 from graings.scene.scene import Scene
 
-# Below this share of the children in every view of a pass the scene has collapsed.
+# Below this share of the children in every step of a pass the scene has collapsed.
 LEAST_SHOWN: Final = 1e-3
 
 # The score that the median child is given again: what children are born with.
 SCORE: Final = 0.1
 
-# An empty picture with a loss up to this is about right: there is hardly anything to see.
-LOSS: Final = 0.02
+# An empty picture that differs by up to this is about right: there is hardly anything to see.
+DIFFERENCE: Final = 0.02
 
 
 class Collapse:
-    """What the views of the current pass have shown, and whether a collapse was mended before.
+    """What the steps of the current pass have shown, and whether a collapse was mended before.
 
-    Call `observe` for each view; after one that ended a pass in which nothing was shown, `missed` says whether there
+    Call `observe` for each step; after one that ended a pass in which nothing was shown, `missed` says whether there
     was something to see.
     """
 
@@ -37,26 +37,29 @@ class Collapse:
         self.mended = False
         self.missed = False
         self._shown = 0.0
-        self._loss = 0.0
+        self._difference = 0.0
 
-    def observe(self, drawn: int, slots: int, loss: float, *, last_of_pass: bool) -> bool:
-        """Record a view that drew `drawn` of `slots` children; True when the pass it ends has shown a collapse."""
+    def observe(self, drawn: int, slots: int, difference: float, *, last_of_pass: bool) -> bool:
+        """Record a step that drew `drawn` of `slots` children; True when the pass it ends has shown a collapse.
+
+        `difference` is the largest photometric loss of its views.
+        """
         self._shown = max(self._shown, drawn / max(slots, 1))
-        if math.isfinite(loss):  # what is not is the guard's to judge
-            self._loss = max(self._loss, loss)
+        if math.isfinite(difference):  # what is not is the guard's to judge
+            self._difference = max(self._difference, difference)
         if not last_of_pass:
             return False
-        collapsed, self.missed = self._shown < LEAST_SHOWN, self._loss > LOSS
-        self._shown = self._loss = 0.0
+        collapsed, self.missed = self._shown < LEAST_SHOWN, self._difference > DIFFERENCE
+        self._shown = self._difference = 0.0
         return collapsed
 
     def state(self) -> dict[str, Any]:
         """Plain numbers to go on from."""
-        return {"mended": self.mended, "shown": self._shown, "loss": self._loss}
+        return {"mended": self.mended, "shown": self._shown, "loss": self._difference}
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from what `state()` gave."""
-        self.mended, self._shown, self._loss = bool(state["mended"]), float(state["shown"]), float(state["loss"])
+        self.mended, self._shown, self._difference = bool(state["mended"]), float(state["shown"]), float(state["loss"])
 
 
 def mean_logits(scene: Scene) -> Float[Tensor, "anchor child"]:

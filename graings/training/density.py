@@ -62,7 +62,7 @@ class DensityStatistics:
         opacities: Float[Tensor, "anchor child"],
         size: tuple[int, int],
     ) -> None:
-        """Record one step.
+        """Record one view of a step.
 
         `children` are flat slots, `screen_gradient` is dL/d(mean in pixels), `visible` says which Gaussians
         touched the image of `size` (width, height), `opacities` are the scores of every slot.

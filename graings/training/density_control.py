@@ -27,7 +27,8 @@ class DensityControl:
     """Grows and prunes one scene. `voxel_size` is that of the finest cells, normalised."""
 
     def __init__(self, config: TrainConfig, scene: Scene, voxel_size: float) -> None:
-        budget = min(config.density.max_anchors, affordable_anchors(config.scene, config.density.memory_mb))
+        affordable = affordable_anchors(config.scene, config.batch, config.density.memory_mb)
+        budget = min(config.density.max_anchors, affordable)
         self.config = config.density.model_copy(update={"max_anchors": budget})
         self.scaled = config.scaled
         self.voxel_size = voxel_size

@@ -51,7 +51,7 @@ class EvaluationPoint:
 
 
 class Journal:
-    """The book of the run in `folder`. `gaussians` is how many were drawn last; `diverged` says why it gave up."""
+    """The book of the run in `folder`. `gaussians` is how many the last step drew; `diverged` says why it gave up."""
 
     def __init__(self, folder: Path, capture: Capture, config: TrainConfig, plan: Plan, clock: Clock) -> None:
         self.folder = folder

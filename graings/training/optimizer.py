@@ -20,7 +20,7 @@ from graings.training.guard import Gradient
 from graings.training.muon import Muon
 
 # Rates are those of one view a step; with more they rise by this power of their number. Steps of four views at 1.5
-# times the rates end where four times as many steps of one view do (docs/experiments.md).
+# times the rates end where twice as many steps of two views do (docs/experiments.md).
 BATCH_POWER = 1 / 3
 
 ADAM_EPSILON = 1e-15  # gradients of one Gaussian are tiny; the usual 1e-8 would damp them (3DGS)
@@ -62,16 +62,16 @@ def _steps_by_muon(name: str, parameter: nn.Parameter) -> bool:
 
 
 class Optimizer:
-    """Adam, and Muon, for one scene.
+    """Adam, and Muon, for one scene, and steps that look at `views` views each.
 
     `step(iteration)` sets the rates for that iteration, steps the groups whose parameters have gradients and
     clears the gradients. `damping` is a factor on all rates.
     """
 
-    def __init__(self, scene: Scene, config: TrainConfig, joint_from: int) -> None:
+    def __init__(self, scene: Scene, config: TrainConfig, joint_from: int, views: int = 1) -> None:
         self.scene = scene
         self.rates: RatesConfig = config.rates
-        self.gain = config.batch**BATCH_POWER
+        self.gain = views**BATCH_POWER
         self.iterations = config.iterations
         self.joint_from = joint_from
         self.damping = 1.0
@@ -89,7 +89,7 @@ class Optimizer:
         self.muon = Muon(matrices)
 
     def rate(self, group: str, iteration: int, like: str | None = None) -> float:
-        """Learning rate of `group` at `iteration` (from 1): log-linear from first to last.
+        """Learning rate of `group` at `iteration` (from 1): log-linear from first to last, more for more views.
 
         It runs over the iterations in which `like` (left out: the group itself) moves.
         """

@@ -45,10 +45,14 @@ class ViewSampler:
         self.generator = generator
         self.remaining = torch.empty(0, dtype=torch.int64)
 
+    def begin(self) -> None:
+        """Begin a new round, whatever is left of this one."""
+        self.remaining = torch.randperm(self.count, generator=self.generator)
+
     def next(self) -> int:
         """Index of the next view."""
         if len(self.remaining) == 0:
-            self.remaining = torch.randperm(self.count, generator=self.generator)
+            self.begin()
         index = int(self.remaining[0])
         self.remaining = self.remaining[1:]
         return index

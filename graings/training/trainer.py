@@ -6,7 +6,6 @@ Never prints, logs, saves or asks: whoever iterates decides. Knows nothing of fi
 from __future__ import annotations
 
 import copy
-import itertools
 import math
 import statistics
 import time
@@ -67,7 +66,10 @@ def phases(config: TrainConfig) -> tuple[Phase, ...]:
 
 @dataclass(frozen=True, slots=True)
 class StepReport:
-    """One step: what it did and what it cost. `psnr` is that of the training view just drawn, in dB."""
+    """One step: what it did and what it cost.
+
+    `psnr`, in dB, is the mean of the training views just drawn; `gaussians` is how many any of them drew.
+    """
 
     iteration: int
     iterations: int
@@ -101,7 +103,8 @@ class Trainer:
 
     def _attach(self, voxel_size: float) -> None:
         """Everything whose shape follows the scene, and what watches over it."""
-        self.optimizer = Optimizer(self.scene, self.config, joint_from=self.phases[-1].first - 1)
+        views = min(self.config.batch, len(self.capture.train))
+        self.optimizer = Optimizer(self.scene, self.config, joint_from=self.phases[-1].first - 1, views=views)
         self.density = DensityControl(self.config, self.scene, voxel_size)
         self.guard = Guard(self.config.guard)
         self.collapse = Collapse()
@@ -136,9 +139,10 @@ class Trainer:
             draw(composition, frame.camera, self.background, means2d_offset=offset)
             for composition, frame, offset in zip(compositions, frames, offsets, strict=True)
         ]
-        loss = self.regularisers(compositions, [frame.time for frame in frames])
-        for result, target in zip(results, targets, strict=True):
-            loss = loss + photometric(result.color, target, self.config.loss.ssim) / len(frames)
+        differences = torch.stack(
+            [photometric(r.color, target, self.config.loss.ssim) for r, target in zip(results, targets, strict=True)]
+        )
+        loss = self.regularisers(compositions, [frame.time for frame in frames]) + differences.mean()
         # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.
         if loss.requires_grad:
             loss.backward()
@@ -172,7 +176,7 @@ class Trainer:
             moments = ", ".join(f"{frame.time:.4g}" for frame in frames)
             events.append(f"skipped: {verdict.culprit} was not finite on {names} at t = {moments}")
         events += self._adapt()
-        events += self._watch(len(children), float(loss.detach()))
+        events += self._watch(len(children), float(differences.detach().amax()))
         self._settle()
         errors = [float(functional.mse_loss(r.color.detach(), t)) for r, t in zip(results, targets, strict=True)]
         return StepReport(
@@ -201,19 +205,19 @@ class Trainer:
         return [f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens"]
 
     def next_frames(self) -> list[Frame]:
-        """The next `batch` views that take part by now; fewer where a pass ends before."""
-        views: list[int] = []
-        while not views or (len(views) < self.config.batch and self._upcoming()):
-            view = self.sampler.next()
-            if self.window.has(view, self.iteration):
-                views.append(view)
+        """The views of the next step: of those that take part by now at most `batch`, shared out evenly over a pass."""
+        while not (views := self._upcoming()):
+            self.sampler.begin()  # what is left of this pass does not take part
+        while self.sampler.next() != views[-1]:
+            pass  # those passed over do not take part
         return [self.capture.train[view] for view in views]
 
     def _upcoming(self) -> list[int]:
         """The views of the next step, as far as this pass goes; none at its end."""
         remaining = self.sampler.remaining.tolist()
-        taking_part = (view for view in remaining if self.window.has(view, self.iteration))
-        return list(itertools.islice(taking_part, self.config.batch))
+        taking_part = [view for view in remaining if self.window.has(view, self.iteration)]
+        steps = math.ceil(len(taking_part) / self.config.batch)
+        return taking_part[: math.ceil(len(taking_part) / steps)] if steps else []
 
     def regularisers(self, compositions: Sequence[Composition], moments: Sequence[float]) -> Tensor:
         """The terms of Eq. 14 on the model itself, with this run's weights and stream of time pairs."""
@@ -231,13 +235,13 @@ class Trainer:
             events += self.density.prune(self.scene, self.optimizer)
         return events
 
-    def _watch(self, drawn: int, loss: float) -> list[str]:
+    def _watch(self, drawn: int, difference: float) -> list[str]:
         """Look after the scene's health and go back where it is lost; returns what happened, in words."""
         events: list[str] = []
         scaffold, every = self.scene.scaffold, self.config.guard
         problem = self.guard.problem()
         last_of_pass = not self._upcoming()
-        if self.collapse.observe(drawn, scaffold.count * scaffold.slots, loss, last_of_pass=last_of_pass):
+        if self.collapse.observe(drawn, scaffold.count * scaffold.slots, difference, last_of_pass=last_of_pass):
             problem = problem or self._lost()
             if problem is None and not self.collapse.mended:
                 shift = mend(self.scene)

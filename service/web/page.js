@@ -123,7 +123,7 @@ function facts(job) {
     ["Speed", job.state === "running" && report.iterations_per_s && `${report.iterations_per_s.toFixed(1)} it/s`],
     ["Time left", job.state === "running" && report.eta_s != null && span(report.eta_s)],
     ["Trained for", report.train_s != null && span(report.train_s)],
-    ["Training view", report.psnr != null && `${report.psnr.toFixed(2)} dB`],
+    ["Training views", report.psnr != null && `${report.psnr.toFixed(2)} dB`],
     ["Held-out views", report.held_out_psnr != null && `${report.held_out_psnr.toFixed(2)} dB`],
     ["Gaussians drawn", report.gaussians != null && count(report.gaussians)],
     ["Anchors", report.anchors != null && count(report.anchors)],

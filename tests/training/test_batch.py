@@ -43,6 +43,15 @@ def test_a_pass_shows_every_view_once_and_no_step_reaches_into_the_next(
             trainer.step()
         assert sorted(name for step in taken for name in step) == sorted(names)
         assert len(taken) == -(-len(names) // batch)
+        sizes = [len(step) for step in taken]
+        assert max(sizes) - min(sizes) <= 1
+
+
+def test_rates_are_those_of_the_views_a_step_can_have(micro: Path) -> None:
+    few, some = micro_trainer(micro, batch=50), micro_trainer(micro, batch=2)
+    views = len(few.capture.train)
+    ratio = few.optimizer.rate("offsets", 1) / some.optimizer.rate("offsets", 1)
+    assert ratio == pytest.approx((views / 2) ** (1 / 3))
 
 
 def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:

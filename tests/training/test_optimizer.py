@@ -30,7 +30,7 @@ def test_temporal_rates_start_with_the_joint_phase() -> None:
 
 
 def test_rates_rise_by_the_cube_root_of_the_views_of_a_step() -> None:
-    one, eight = (Optimizer(tiny_scene(), TrainConfig(iterations=1000, batch=n), joint_from=100) for n in (1, 8))
+    one, eight = (Optimizer(tiny_scene(), TrainConfig(iterations=1000), joint_from=100, views=n) for n in (1, 8))
     for group in ("offsets", "matrices", "color"):
         assert eight.rate(group, 400) == pytest.approx(2 * one.rate(group, 400))
 
