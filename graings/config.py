@@ -100,17 +100,24 @@ class InitConfig(Part):
 
 
 class LossConfig(Part):
-    """Weights of Eq. 14-18; the l_* switches are the paper's ablations. Owner: `graings.training.losses`."""
+    """Weights of Eq. 14-18 and of rigidity; the l_* switches are for ablations. Owner: `graings.training.losses`."""
 
     ssim: float = Field(0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss.")
     temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
     deformation: float = Field(0.001, ge=0, description="lambda_2, magnitude of the deformation.")
     residual: float = Field(0.01, ge=0, description="lambda_3, magnitude of the appearance residual.")
+    rigidity: float = Field(
+        0.02,
+        ge=0,
+        description="Weight of the strain between the instants of a step, that is how much neighbouring Gaussians come "
+        "apart. Not in the paper; a step of one view has none.",
+    )
     gain: float = Field(1.0, ge=0, description="Common factor on the three means over children (decision 10).")
     temporal_share: float = Field(0.1, gt=0, le=1, description="Share of drawn children in the temporal term per step.")
     l_temp: bool = Field(True, description="Ablation switch of the temporal term.")
     l_def: bool = Field(True, description="Ablation switch of the deformation term.")
     l_res: bool = Field(True, description="Ablation switch of the residual term.")
+    l_rigid: bool = Field(True, description="Ablation switch of the strain.")
 
 
 class DensityConfig(Part):
@@ -119,8 +126,8 @@ class DensityConfig(Part):
     statistics_from: int = Field(500, ge=0, description="First iteration of the growth statistics.")
     grow_from: int = Field(1_500, ge=0, description="First growth.")
     grow_until: int = Field(20_000, ge=0, description="Last growth.")
-    grow_every: int = Field(100, ge=1, description="Iterations between growths (not scaled).")
-    gradient_threshold: float = Field(3e-4, gt=0, description="tau_g, mean screen gradient in NDC units.")
+    grow_every: int = Field(50, ge=1, description="Iterations between growths (not scaled).")
+    gradient_threshold: float = Field(2e-4, gt=0, description="tau_g, mean screen gradient in NDC units.")
     min_observations: int = Field(40, ge=0, description="tau_obs, times a child must have been drawn (not scaled).")
     levels: int = Field(3, ge=1, le=6, description="Cell sizes 4^(levels-1) v ... v.")
     newborn_opacity: float | None = Field(
@@ -243,15 +250,18 @@ PRESETS: dict[str, dict[str, Any]] = {
         # Many views of few Gaussians: what moves is found sooner than with few views of many.
         "iterations": 1_000,
         "batch": 4,
-        "density": {"grow_every": 50, "min_observations": 20, "max_anchors": 1_200},
+        "density": {"gradient_threshold": 3e-4, "min_observations": 20, "max_anchors": 1_200},
         "evaluation": {"checkpoint_every": 250},  # a look at what there is by then, half a minute from the start
         "rates": {"offsets": (0.03, 3e-4), "matrices": (8e-3, 2e-4)},
     },
-    # Growth as often a view as with one view a step, and from the paper's threshold on.
-    "standard": {"iterations": 5_000, "batch": 4, "density": {"grow_every": 50, "gradient_threshold": 2e-4}},
-    "fine": {"iterations": 15_000, "batch": 4},
-    # As the paper trains: one view a step.
-    "paper": {"iterations": PAPER_ITERATIONS, "batch": 1},
+    "standard": {},
+    "fine": {"iterations": 15_000},
+    # As the paper trains: one view a step. With four, half as many rounds of growth a view are enough.
+    "paper": {
+        "iterations": PAPER_ITERATIONS,
+        "batch": 1,
+        "density": {"grow_every": 100, "gradient_threshold": 3e-4},
+    },
 }
 
 

@@ -46,6 +46,8 @@ class Plan:
             scene["residual"] = False
         if self.drops("temporal_loss"):
             loss["l_temp"] = False
+        if self.drops("rigidity"):
+            loss["l_rigid"] = False
         return config.model_copy(
             update={"scene": config.scene.model_copy(update=scene), "loss": config.loss.model_copy(update=loss)}
         )
@@ -81,6 +83,12 @@ def make_plan(capture: Capture, config: TrainConfig) -> Plan:
         )
     static = single or config.scene.deformation == "none"
     decide("temporal_loss", static, "no pair of times" if static else f"{noun}", "exact")
+    alone = config.batch == 1 or len(capture.train) == 1
+    if not config.loss.l_rigid or config.loss.rigidity == 0:
+        decisions.append(Decision("rigidity", "drop", "user", "loss.rigidity is 0 or loss.l_rigid off"))
+    else:
+        reason = "nothing moves" if static else "one view a step" if alone else "neighbours move together"
+        decide("rigidity", static or alone, reason, "exact")
     cloud = capture.points is not None
     decide("random_points", cloud, "the capture brings its own points" if cloud else "no point cloud in the capture")
     decide(

@@ -23,6 +23,7 @@ METHOD: Final[Mapping[str, Any]] = {
     "loss.l_temp": True,
     "loss.l_def": True,
     "loss.l_res": True,
+    "loss.l_rigid": True,
 }
 
 FULL: Final = "full"
@@ -115,6 +116,7 @@ ROWS: Final[tuple[Row, ...]] = (
         {"scene.canonical": False},
         paper=PaperResult(35.834, 0.9812, 0.0221, "ablation"),
     ),
+    Row("no_rigidity", "without rigidity", {"loss.l_rigid": False}, needs=("loss.rigidity",)),
     Row("anchor_deformation", "deformation per anchor", {"scene.deformation": "anchor"}),
 )
 

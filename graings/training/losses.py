@@ -7,10 +7,16 @@ growth. Knows nothing of schedules or optimisers.
 
 from __future__ import annotations
 
+from typing import Final
+
 from jaxtyping import Float
 from torch import Tensor
 
 from graings.scene.deformation import Deformation
+
+# A strain well above this costs in proportion, so that joints may bend for the price of what they bend; one well below,
+# with its square, so that what hardly moves is left alone.
+SLIGHT_STRAIN: Final = 0.01
 
 
 def temporal(
@@ -33,3 +39,16 @@ def deformation(offsets: Deformation) -> Tensor:
 def residual(change: Float[Tensor, "gaussian 4"]) -> Tensor:
     """Mean squared appearance residual (Delta c, Delta o), Eq. 18."""
     return change.square().sum(-1).mean()
+
+
+def rigidity(lengths: Float[Tensor, "instant pair"], weights: Float[Tensor, " pair"]) -> Tensor:
+    """Mean strain of pairs of Gaussians: how far their `lengths` at several instants are from their mean, beside it.
+
+    Zero where everything moves as rigid bodies do. Not in the paper: what one camera sees of an instant says nothing of
+    depth along its rays, and neighbours do (the isometry of Luiten et al., "Dynamic 3D Gaussians", between the
+    instants of a step instead of from one frame to the next). Lengths are positive.
+    """
+    mean = lengths.mean(0)
+    strain = (lengths - mean) / mean.detach()
+    cost = (strain.square() + SLIGHT_STRAIN**2).sqrt() - SLIGHT_STRAIN
+    return (cost.mean(0) * weights).sum() / weights.sum().clamp_min(1.0)

@@ -1,7 +1,7 @@
 """Regularisers: the terms of Eq. 14 on the model itself, weighted, for the views of one step.
 
-Chooses the pair of times and the sample of children that the temporal term compares. Knows nothing of images,
-schedules or optimisers.
+Chooses the pair of times and the sample of children that the temporal term compares, and the pairs of children that
+rigidity does. Knows nothing of images, schedules or optimisers.
 """
 
 from __future__ import annotations
@@ -17,6 +17,15 @@ from torch import Tensor
 from graings.config import LossConfig
 from graings.scene.scene import Composition, Scene
 from graings.training import losses
+from graings.training.streams import Streams
+
+# Rigidity pairs each child with the one at most so many places further on in the order of slots: of its own anchor, or
+# of one born near it.
+REACH = 30
+
+# Only pairs between these distances count, in units of the scene's extent: further apart are other bodies, and of
+# closer ones the length is rounding.
+NEAREST, FARTHEST = 1e-3, 0.2
 
 # The temporal term looks at no fewer children than this (decision 10).
 MIN_TEMPORAL_SAMPLE = 2_000
@@ -28,12 +37,13 @@ def regularisers(
     moments: Sequence[float],
     times: NDArray[np.float64],
     config: LossConfig,
-    generator: torch.Generator,
+    streams: Streams,
 ) -> Float[Tensor, ""]:
-    """lambda_1 L_temp + lambda_2 L_def + lambda_3 L_res of one step's `compositions`; zero in the static phase.
+    """lambda_1 L_temp + lambda_2 L_def + lambda_3 L_res of one step's `compositions`, and rigidity between them.
 
-    They were composed together at `moments`, of which the first also gives L_temp its pair of times: one per step
-    (decision 10). `times` are the capture's training times, ascending; `generator` draws the neighbour and the sample.
+    Zero in the static phase. They were composed together at `moments`, of which the first also gives L_temp its pair of
+    times: one per step (decision 10). `times` are the capture's training times, ascending; of `streams`, time_pairs
+    draws the neighbour and the sample, and child_pairs who is compared with whom.
     """
     total = torch.zeros(())
     first = compositions[0]
@@ -41,7 +51,10 @@ def regularisers(
         return total
     if first.deformation is not None and config.l_temp and len(times) > 1:
         share = config.temporal_share
+        generator = streams["time_pairs"]
         total = total + config.gain * config.temporal * _temporal(scene, first, moments[0], times, share, generator)
+    if config.l_rigid and config.rigidity > 0:
+        total = total + config.rigidity * _rigidity(compositions, float(scene.extent), streams["child_pairs"])
     for one in compositions:
         if one.deformation is not None and config.l_def:
             total = total + config.gain * config.deformation * losses.deformation(one.deformation) / len(compositions)
@@ -71,3 +84,18 @@ def _temporal(
     gap = abs(float(times[there] - times[here]))
     mean_gap = float(times[-1] - times[0]) / (len(times) - 1)
     return losses.temporal(composition.deformation.position[sample], neighbour.position, gap, mean_gap)
+
+
+def _rigidity(compositions: Sequence[Composition], extent: float, generator: torch.Generator) -> Tensor:
+    """How much the distances between children differ between these instants; canonical places are taken as they are."""
+    offsets = [one.deformation.position for one in compositions if one.deformation is not None]
+    canonical = compositions[0].canonical_means.detach()
+    step = int(torch.randint(1, REACH + 1, (1,), generator=generator))
+    if len(offsets) < 2 or len(canonical) <= step:
+        return torch.zeros(())
+    gaps = [((places := canonical + offset)[step:] - places[:-step]) / extent for offset in offsets]
+    lengths = torch.stack([(gap.square().sum(-1) + NEAREST**2 / 4).sqrt() for gap in gaps])
+    mean = lengths.detach().mean(0)
+    opacities = torch.stack([one.gaussians.opacities.detach() for one in compositions]).amin(0)
+    weights = torch.minimum(opacities[step:], opacities[:-step]) * ((mean > NEAREST) & (mean < FARTHEST))
+    return losses.rigidity(lengths, weights)

@@ -220,9 +220,8 @@ class Trainer:
         return taking_part[: math.ceil(len(taking_part) / steps)] if steps else []
 
     def regularisers(self, compositions: Sequence[Composition], moments: Sequence[float]) -> Tensor:
-        """The terms of Eq. 14 on the model itself, with this run's weights and stream of time pairs."""
-        generator = self.streams["time_pairs"]
-        return regularisers(self.scene, compositions, moments, self.times, self.config.loss, generator)
+        """The terms on the model itself, with this run's weights and streams."""
+        return regularisers(self.scene, compositions, moments, self.times, self.config.loss, self.streams)
 
     def _adapt(self) -> list[str]:
         """Grow and prune where the schedule says so; returns what happened, in words."""

@@ -22,6 +22,7 @@ CHANGES = {
     "single_mlp": {"scene.single_mlp": True},
     "no_residual": {"scene.residual": False},
     "no_canonical": {"scene.canonical": False},
+    "no_rigidity": {"loss.l_rigid": False},
     "anchor_deformation": {"scene.deformation": "anchor"},
 }
 
@@ -35,6 +36,7 @@ PAPER = {
     "single_mlp": -0.781,
     "no_residual": -0.470,
     "no_canonical": -1.148,
+    "no_rigidity": None,
     "anchor_deformation": None,
 }
 

@@ -56,7 +56,7 @@ def test_rates_are_those_of_the_views_a_step_can_have(micro: Path) -> None:
 
 def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = micro_trainer(
-        micro, batch=3, warmup=0, **{"loss.l_temp": False, "loss.l_def": False, "loss.l_res": False}
+        micro, batch=3, warmup=0, **{f"loss.l_{name}": False for name in ("temp", "def", "res", "rigid")}
     )
     steps(trainer, 5)
     before, chosen, stepped = copy.deepcopy(trainer.scene), [], {}

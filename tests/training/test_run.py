@@ -160,9 +160,11 @@ def test_a_run_that_does_not_say_goes_on_as_it_began(capture: Path, tmp_path: Pa
     facts = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (facts["config"].pop("matrix_step"), facts["config"].pop("average_from")) == ("muon", 29_000)
     assert facts["config"].pop("time_window") is None
+    assert (facts["config"].pop("batch"), facts["config"]["loss"].pop("rigidity")) == (4, 0.02)
     (tmp_path / "run" / "run.json").write_text(json.dumps(facts))
     config = TrainingRun.resume(tmp_path / "run").config
     assert (config.matrix_step, config.average_from, config.time_window) == ("adam", 30_000, 1.0)
+    assert (config.batch, config.loss.rigidity) == (1, 0.0)
 
 
 def test_a_run_cut_off_before_its_metrics_writes_them_when_resumed(capture: Path, tmp_path: Path) -> None:
@@ -248,7 +250,7 @@ def test_a_single_instant_leaves_the_deformation_out_and_says_so(capture: Path, 
     decisions = json.loads((tmp_path / "run" / "metrics.json").read_text())["plan"]["decisions"]
     dropped = {d["component"]: d["reason"] for d in decisions if d["decision"] == "drop"}
     assert "1 distinct training time" in dropped["deformation"]
-    assert {"deformation", "residual", "temporal_loss"} <= set(dropped)
+    assert {"deformation", "residual", "temporal_loss", "rigidity"} <= set(dropped)
 
 
 @pytest.mark.parametrize(
@@ -258,6 +260,7 @@ def test_a_single_instant_leaves_the_deformation_out_and_says_so(capture: Path, 
         {"loss.l_temp": False},
         {"loss.l_def": False},
         {"loss.l_res": False},
+        {"loss.l_rigid": False},
         {"scene.single_mlp": True},
         {"scene.residual": False},
         {"scene.canonical": False},
