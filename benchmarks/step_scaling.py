@@ -5,7 +5,7 @@
 Continues RUN (a folder with a checkpoint) in memory; nothing in it is written. Fewer Gaussians are a random share of
 its anchors, other sizes the same capture read anew, so the largest useful size is that of its files. Writes
 FOLDER/step_scaling.{json,svg} and prints median milliseconds and the slope of log time against log size: 1 is linear, 0
-does not grow. The parts are those of training_step.py.
+does not grow. A step has as many views as the run says. The parts are those of training_step.py.
 """
 
 from __future__ import annotations
@@ -75,11 +75,15 @@ def main() -> None:
     for axis, (title, rows) in zip(axes, series.items(), strict=True):
         show(axis, title, rows, "part")
     axes[0].set_ylabel("milliseconds")
-    figure.suptitle(f"What one training step costs ({kernel.active_isa()}, {kernel.threads()} threads)")
+    views = trainer.config.batch
+    figure.suptitle(
+        f"What one training step of {views} views costs ({kernel.active_isa()}, {kernel.threads()} threads)"
+    )
     options.output.mkdir(parents=True, exist_ok=True)
     document = {
         "isa": kernel.active_isa(),
         "threads": kernel.threads(),
+        "views": views,
         "series": {title: {str(size): row for size, row in rows.items()} for title, rows in series.items()},
     }
     (options.output / "step_scaling.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")

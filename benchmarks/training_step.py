@@ -2,8 +2,9 @@
 
     python benchmarks/training_step.py RUN [--steps 50] [--threads 2] [--batch 1]
 
-Continues the run in memory (nothing is written) and measures each part of a step apart; the parts are timed
-in the order of a real step, and the last line compares their sum with the unbroken `Trainer.step`.
+Continues the run in memory (nothing is written) and measures each part of a step apart: drawing, its loss and its way
+back view by view, where a real step draws all views first. The last line compares the sum with the unbroken
+`Trainer.step`.
 """
 
 from __future__ import annotations
@@ -54,6 +55,8 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     frames = trainer.next_frames()
     watch.start()
     targets = [torch.from_numpy(trainer.images.rgb(frame)) for frame in frames]
+    for view in trainer._upcoming():
+        trainer.images.prefetch(trainer.capture.train[view])
     watch.lap("images")
     compositions = trainer.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
     watch.lap("scene forward")
