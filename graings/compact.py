@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
@@ -44,13 +44,16 @@ def write_compact(model: Model, path: Path) -> int:
     Raises `CheckpointError` where the file cannot be written.
     """
     tensors = {name: tensor.detach() for name, tensor in model.scene.state_dict().items()}
+    for name in _HALVED:
+        halved = tensors[f"scaffold.{name}"].half()
+        if bool(halved.isfinite().all()):  # half precision ends at 65 504; what is larger must not become infinite
+            tensors[f"scaffold.{name}"] = halved
     order = tensors["scaffold.uids"].argsort()
-    order = order[can_be_seen(model.scene)[order]]
+    # Asked of what is written, so that a file read and written again is the same file.
+    seen = can_be_seen(model.scene, *(tensors[f"scaffold.{name}"].float() for name in _HALVED))
+    order = order[seen[order]]
     for name in Scaffold.ROWS:
-        rows = tensors[f"scaffold.{name}"][order]
-        halved = rows.half()
-        # Half precision ends at 65 504; what is larger must not become infinite.
-        tensors[f"scaffold.{name}"] = halved if name in _HALVED and bool(halved.isfinite().all()) else rows
+        tensors[f"scaffold.{name}"] = tensors[f"scaffold.{name}"][order]
     # Ties between Gaussians are broken by the order of birth, which their order in the file keeps.
     del tensors["scaffold.uids"]
     facts = model_facts(
@@ -100,11 +103,16 @@ def open_model(path: Path) -> Model:
     return read_compact(path) if path.is_file() else load_model(path)
 
 
-def can_be_seen(scene: Scene) -> Bool[Tensor, " anchor"]:
-    """Which anchors have a child that may be drawn at some time from somewhere; the others never change a pixel."""
+def can_be_seen(
+    scene: Scene, features: Float[Tensor, "anchor feature"], opacity_offsets: Float[Tensor, " anchor"]
+) -> Bool[Tensor, " anchor"]:
+    """Which anchors with these rows have a child that may be drawn at some time from somewhere.
+
+    The others never change a pixel.
+    """
     with torch.no_grad():
-        logits = scene.appearance.highest_opacity_logits(scene.scaffold.features)
-        highest = torch.tanh(logits + scene.scaffold.opacity_offsets.unsqueeze(-1)).amax(-1)
-    # The residual is bounded; a hundredth of its bound covers what half precision does to a score.
+        logits = scene.appearance.highest_opacity_logits(features)
+        highest = torch.tanh(logits + opacity_offsets.unsqueeze(-1)).amax(-1)
+    # The residual is bounded; a hundredth of its bound covers what rounding does to a score.
     reach = 1.01 * scene.residual.scale if scene.residual is not None else 0.0
     return highest > constants.ALPHA_MIN - reach

@@ -70,7 +70,7 @@ def test_only_anchors_that_nothing_can_show_are_left_out(residual: bool, view: b
     scene = tiny_scene(anchors=300, residual=residual, opacity_view=view)
     with torch.no_grad():
         scene.scaffold.opacity_offsets.copy_(torch.linspace(-1.5, 0.5, 300))
-    kept = can_be_seen(scene)
+    kept = can_be_seen(scene, scene.scaffold.features, scene.scaffold.opacity_offsets)
     assert 0 < int(kept.sum()) < 300
     eyes = torch.randn(21, 3, generator=torch.Generator().manual_seed(0)) * 3
     for eye, time in zip(eyes.tolist(), torch.linspace(0, 1, 21).tolist(), strict=True):

@@ -96,7 +96,12 @@ class TrainingRun:
             raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
         stored = facts.get("config")
         if isinstance(stored, dict):  # what a run does not say is as it was when there was no choice
-            before = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS, "time_window": 1.0, "batch": 1}
+            before: dict[str, Any] = {
+                "matrix_step": "adam",
+                "average_from": PAPER_ITERATIONS,
+                "time_window": 1.0,
+                "batch": 1,
+            }
             stored = before | stored
             if isinstance(stored.get("loss"), dict):
                 stored["loss"] = {"rigidity": 0.0} | stored["loss"]
