@@ -294,6 +294,16 @@ def restored(kind: type[Stored], values: Any, source: Path) -> Stored:
         ) from error
 
 
+def restored_training(values: Any, source: Path) -> TrainConfig:
+    """As `restored`, for options of a run: what an older file does not name is as it was when there was no choice."""
+    if isinstance(values, dict):
+        before = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS, "time_window": 1.0, "batch": 1}
+        values = before | values
+        if isinstance(values.get("loss"), dict):
+            values["loss"] = {"rigidity": 0.0} | values["loss"]
+    return restored(TrainConfig, values, source)
+
+
 def _problems(error: ValidationError) -> str:
     return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
 

@@ -14,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from graings.camera import Camera, View
-from graings.config import SceneConfig, TrainConfig, restored
+from graings.config import SceneConfig, TrainConfig, restored, restored_training
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.units import Units
@@ -71,7 +71,7 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
 
     Raises `CheckpointError` for options of another version, and whatever broken facts provoke.
     """
-    config = restored(TrainConfig, facts["config"], path)
+    config = restored_training(facts["config"], path)
     shape = restored(SceneConfig, BEFORE | facts["scene_config"], path)
     rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
     scene = Scene(shape, Scaffold(**rows), extent=float(tensors["extent"]), initial_opacity=0.1)

@@ -52,14 +52,14 @@ PAPER_FULL: Final = PaperResult(36.982, 0.9871, 0.0136, "ablation_stopgrad")
 class Row:
     """One model of the comparison.
 
-    `changes` are the switches it takes back, by dotted option name; `needs` are weights that must not be zero for the
-    row to differ from the full model at all; `paper` is None where the paper has no number.
+    `changes` are the switches it takes back, by dotted option name; `needs` are options that must exceed these numbers
+    for the row to differ from the full model at all; `paper` is None where the paper has no number.
     """
 
     name: str
     label: str
     changes: Mapping[str, Any] = field(default_factory=dict)
-    needs: tuple[str, ...] = ()
+    needs: Mapping[str, float] = field(default_factory=dict)
     paper: PaperResult | None = None
 
     @property
@@ -80,21 +80,21 @@ ROWS: Final[tuple[Row, ...]] = (
         "no_l_temp",
         "without L_temp",
         {"loss.l_temp": False},
-        needs=("loss.temporal", "loss.gain"),
+        needs={"loss.temporal": 0, "loss.gain": 0},
         paper=PaperResult(36.214, 0.9829, 0.0167, "ablation_loss"),
     ),
     Row(
         "no_l_def",
         "without L_def",
         {"loss.l_def": False},
-        needs=("loss.deformation", "loss.gain"),
+        needs={"loss.deformation": 0, "loss.gain": 0},
         paper=PaperResult(36.461, 0.9856, 0.0154, "ablation_loss"),
     ),
     Row(
         "no_l_res",
         "without L_res",
         {"loss.l_res": False},
-        needs=("loss.residual", "loss.gain", "scene.residual_scale"),
+        needs={"loss.residual": 0, "loss.gain": 0, "scene.residual_scale": 0},
         paper=PaperResult(36.647, 0.9861, 0.0148, "ablation_loss"),
     ),
     Row(
@@ -107,7 +107,7 @@ ROWS: Final[tuple[Row, ...]] = (
         "no_residual",
         "without residual",
         {"scene.residual": False},
-        needs=("scene.residual_scale",),
+        needs={"scene.residual_scale": 0},
         paper=PaperResult(36.512, 0.9854, 0.0162, "ablation"),
     ),
     Row(
@@ -116,7 +116,7 @@ ROWS: Final[tuple[Row, ...]] = (
         {"scene.canonical": False},
         paper=PaperResult(35.834, 0.9812, 0.0221, "ablation"),
     ),
-    Row("no_rigidity", "without rigidity", {"loss.l_rigid": False}, needs=("loss.rigidity",)),
+    Row("no_rigidity", "without rigidity", {"loss.l_rigid": False}, needs={"loss.rigidity": 0, "batch": 1}),
     Row("anchor_deformation", "deformation per anchor", {"scene.deformation": "anchor"}),
 )
 
@@ -148,11 +148,11 @@ def row_config(row: Row, preset: str, settings: Mapping[str, Any], seed: int) ->
                 f"{key}: is set to {value!r}, but the row {row.name} is {wanted!r} there. "
                 "Leave the setting out, or name the rows that agree with it (--rows)."
             )
-    for key in row.needs:
-        if not _option(asked, key)[0]:
+    for key, number in row.needs.items():
+        if _option(asked, key)[0] <= number:
             raise ConfigError(
-                f"{key}: is 0, so the row {row.name} would be the full model over again. "
-                "Give it a weight, or leave the row out (--rows)."
+                f"{key}: is {number}, so the row {row.name} would be the full model over again. "
+                "Give it more, or leave the row out (--rows)."
             )
     return combined(row, preset, settings, seed)
 

@@ -26,7 +26,7 @@ from graings.checkpoint import (
     save_checkpoint,
 )
 from graings.compact import read_compact, write_compact
-from graings.config import PAPER_ITERATIONS, TrainConfig, restored
+from graings.config import TrainConfig, restored_training
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation import evaluate, subset
 from graings.metrics import Lpips, SplitMetrics
@@ -94,18 +94,7 @@ class TrainingRun:
             facts = json.loads((folder / "run.json").read_text())
         except (OSError, ValueError) as error:
             raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
-        stored = facts.get("config")
-        if isinstance(stored, dict):  # what a run does not say is as it was when there was no choice
-            before: dict[str, Any] = {
-                "matrix_step": "adam",
-                "average_from": PAPER_ITERATIONS,
-                "time_window": 1.0,
-                "batch": 1,
-            }
-            stored = before | stored
-            if isinstance(stored.get("loss"), dict):
-                stored["loss"] = {"rigidity": 0.0} | stored["loss"]
-        config = restored(TrainConfig, stored, folder / "run.json")
+        config = restored_training(facts.get("config"), folder / "run.json")
         clock = Clock()
         started = time.perf_counter()
         data = load_capture(capture or Path(facts["capture"]["path"]), config.capture)

@@ -83,6 +83,11 @@ def test_a_row_that_would_be_the_full_model_over_again_is_refused(name: str, key
         row_config(chosen_rows([name])[0], "draft", {key: 0}, 0)
 
 
+def test_rigidity_between_the_views_of_a_step_needs_two() -> None:
+    with pytest.raises(ConfigError, match=r"batch: is 1.*no_rigidity.*--rows"):
+        row_config(chosen_rows(["no_rigidity"])[0], "paper", {}, 0)
+
+
 def test_a_seed_among_the_settings_is_refused() -> None:
     with pytest.raises(ConfigError, match="--seeds"):
         row_config(ROWS[0], "draft", {"seed": 0}, 0)

@@ -53,6 +53,18 @@ def test_a_finished_job_has_its_report(tmp_path: Path) -> None:
     assert {"training.svg", "render.svg", "points.csv"} < {path.name for path in folder.report.iterdir()}
 
 
+def test_a_job_that_waited_for_this_version_is_trained_as_it_was_asked_for(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    asked = job(store, {"iterations": 12}).spec()
+    asked.config.pop("batch")
+    asked.config["loss"].pop("rigidity")
+    folder = store.folder(store.create(asked, write_synthetic(store.uploads / "v", frames=6, size=24)))
+    with trainer(folder) as process:
+        assert process.wait(60) == ExitCode.DONE
+    trained = load_model(folder.run).config
+    assert (trained.batch, trained.loss.rigidity) == (1, 0.0)
+
+
 def test_trouble_with_the_report_is_logged_and_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
