@@ -1,7 +1,8 @@
 """Scene: what was learned. Composes the Gaussians of one instant as seen from one place (Eq. 3-13).
 
-Opacity is evaluated first and only children that will be drawn go through the geometry networks: a score
-at or below 1/255 leaves no trace in the picture, so this changes no pixel. Knows nothing of pixels, images
+Opacity is evaluated first, and a score at or below 1/255 leaves no trace in the picture: only anchors with a child that
+may exceed it are asked for colours and residuals, and only children that do go through the geometry networks. This
+changes no pixel. Knows nothing of pixels, images
 or losses.
 """
 
@@ -41,7 +42,7 @@ class Composition:
     canonical_means: Float[Tensor, "gaussian 3"]  # x_can
     deformation: Deformation | None
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
-    opacities: Float[Tensor, "anchor child"]  # score o(t) of every slot, drawn or not; no gradient
+    opacities: Float[Tensor, "anchor child"]  # score of every slot, o(t) where it may be drawn at all; no gradient
 
 
 class Scene(nn.Module):
@@ -95,58 +96,63 @@ class Scene(nn.Module):
         A child that one view would have left out has no opacity to speak of there, so no picture changes; and what does
         not depend on the view, most of the networks' work, is done once.
         """
-        scaffold, config = self.scaffold, self.config
-        features = scaffold.features
-        moments = [torch.tensor([time], dtype=features.dtype) for _, time in views]
+        scaffold, config, slots = self.scaffold, self.config, self.scaffold.slots
         directions = [self.directions(eye) for eye, _ in views]
+        times = [time for _, time in views]
 
         residual = self.residual if self.temporal else None
-        scores, changes = self._scores(residual, directions, moments)
+        lasting = self._lasting(directions)
+        awake = _awake(lasting, 0.0 if residual is None else residual.scale)
+        features = scaffold.features.index_select(0, awake)
+        source = features.detach() if config.residual_stop_gradient else features
+        scores = [score.index_select(0, awake) for score in lasting]
+        changes: list[Tensor | None] = [None] * len(views)
+        if residual is not None:
+            changes = [residual(source, torch.tensor([time], dtype=features.dtype)) for time in times]
+            scores = [
+                score if change is None else score + residual.bounded(change[..., 3])
+                for score, change in zip(scores, changes, strict=True)
+            ]
         drawn_anywhere = torch.stack([score.detach() for score in scores]).amax(0).flatten() > constants.ALPHA_MIN
-        children = drawn_anywhere.nonzero().squeeze(-1)
+        places = drawn_anywhere.nonzero().squeeze(-1)  # of what is drawn among the slots of awake anchors
+        children = awake[places // slots] * slots + places % slots
 
         drawn = gather(scaffold, children)
         uids = scaffold.child_uids(children)
         extent = float(self.extent)
         compositions = []
-        answers = self._answers(drawn, children, [time for _, time in views])
-        for score, change, towards, (canonical, raw) in zip(scores, changes, directions, answers, strict=True):
-            colors = self.appearance.colors(features, towards, children)
+        answers = self._answers(drawn, children, times)
+        every = zip(lasting, scores, changes, directions, answers, strict=True)
+        for unchanged, score, change, towards, (canonical, raw) in every:
+            colors = self.appearance.colors(features, towards.index_select(0, awake), places)
             drawn_change = None
             if residual is not None and change is not None:
-                drawn_change = residual.bounded(change.flatten(0, 1).index_select(0, children))
+                drawn_change = residual.bounded(change.flatten(0, 1).index_select(0, places))
                 colors = clip(colors + drawn_change[:, :3], 0.0, 1.0, projected=config.projected_clip)
             means, quats, log_scales = compose(canonical, drawn, raw, extent, projected_clip=config.projected_clip)
             gaussians = Gaussians(
                 means=means,
                 quats=quats,
                 log_scales=log_scales,
-                opacities=score.flatten().index_select(0, children),
+                opacities=score.flatten().index_select(0, places),
                 colors=colors,
                 uids=uids,
             )
             moved = None if raw is None else deformation_from(raw, extent)
-            compositions.append(Composition(gaussians, children, drawn.centres, moved, drawn_change, score.detach()))
+            opacities = unchanged.detach().index_copy(0, awake, score.detach())
+            compositions.append(Composition(gaussians, children, drawn.centres, moved, drawn_change, opacities))
         return compositions
 
-    def _scores(
-        self, residual: ResidualField | None, directions: Sequence[Tensor], moments: Sequence[Tensor]
-    ) -> tuple[list[Tensor], list[Tensor | None]]:
-        """Of each view: the opacity score [A, k] of every slot, and the residual field's answer, if it is asked."""
-        scaffold, config = self.scaffold, self.config
-        offsets = scaffold.opacity_offsets.unsqueeze(-1)
-        features = scaffold.features
-        source = features.detach() if config.residual_stop_gradient else features
-        lasting: Tensor | None = None
+    def _lasting(self, directions: Sequence[Tensor]) -> list[Tensor]:
+        """Of each view: the opacity score [A, k] of every slot before the residual field has spoken."""
+        offsets = self.scaffold.opacity_offsets.unsqueeze(-1)
         scores: list[Tensor] = []
-        changes: list[Tensor | None] = []
-        for towards, moment in zip(directions, moments, strict=True):
-            if lasting is None or config.opacity_view:
-                lasting = tanh(self.appearance.opacity_logits(features, towards) + offsets)
-            change = None if residual is None else residual(source, moment)
-            changes.append(change)
-            scores.append(lasting if residual is None or change is None else lasting + residual.bounded(change[..., 3]))
-        return scores, changes
+        for towards in directions:
+            if not scores or self.config.opacity_view:
+                scores.append(tanh(self.appearance.opacity_logits(self.scaffold.features, towards) + offsets))
+            else:
+                scores.append(scores[0])
+        return scores
 
     def directions(self, eye: ArrayLike) -> Float[Tensor, "anchor 3"]:
         """Unit vectors from the camera centre to every anchor (decision A21)."""
@@ -199,3 +205,9 @@ class Scene(nn.Module):
     def _positions(self, canonical_means: Tensor) -> Tensor:
         """Where a deformation network sees the children: in units of the extent, as a constant if so configured."""
         return (canonical_means.detach() if self.config.stop_gradient else canonical_means) / self.extent
+
+
+def _awake(lasting: Sequence[Float[Tensor, "anchor child"]], reach: float) -> Int64[Tensor, " awake"]:
+    """Anchors with a child that may be drawn in one of the views: no residual adds more than `reach` to a score."""
+    highest = torch.stack([score.detach().amax(-1) for score in lasting]).amax(0)
+    return (highest + reach > constants.ALPHA_MIN).nonzero().squeeze(-1)
