@@ -22,20 +22,22 @@ from graings.scene.perceptron import Shared, perceptron, weights_and_biases
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deformation:
-    """Raw offsets of N Gaussians at one time.
+    """Raw offsets of N Gaussians at one time: of position (normalised units), rotation and log-scales.
 
-    `rotation` is delta with Delta r = normalise((1, 0, 0, 0) + delta) (decision 11); `log_scales` is not yet
-    clipped.
+    Rotation is delta with Delta r = normalise((1, 0, 0, 0) + delta) (decision 11); log-scales are not yet clipped.
     """
 
-    position: Float[Tensor, "gaussian 3"]
-    rotation: Float[Tensor, "gaussian 4"]
-    log_scales: Float[Tensor, "gaussian 3"]
+    offsets: Float[Tensor, "gaussian 10"]
+
+    @property
+    def position(self) -> Float[Tensor, "gaussian 3"]:
+        """What is added to the canonical position."""
+        return self.offsets[:, :3]
 
 
 def deformation_from(raw: Float[Tensor, "gaussian 10"], extent: float) -> Deformation:
     """Network output to offsets; positions come in units of the scene's extent, so rates need no length."""
-    return Deformation(raw[:, :3] * extent, raw[:, 3:7], raw[:, 7:10])
+    return Deformation(raw * torch.tensor([extent] * 3 + [1.0] * 7, dtype=raw.dtype))
 
 
 class DeformationNetwork(nn.Module):

@@ -7,10 +7,12 @@ growth. Knows nothing of schedules or optimisers.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from graings.scene.deformation import Deformation
 
@@ -26,19 +28,17 @@ def temporal(
 
     `gap` is the time between them and `mean_gap` the capture's mean: an irregular pair counts by its speed.
     """
-    return (now - neighbour).square().sum(-1).mean() * (mean_gap / gap)
+    return mean_square(now - neighbour) * (mean_gap / gap)
 
 
 def deformation(offsets: Deformation) -> Tensor:
     """Mean squared magnitude of all geometric offsets, Eq. 17; rotation as its distance from none."""
-    return (
-        offsets.position.square().sum(-1) + offsets.rotation.square().sum(-1) + offsets.log_scales.square().sum(-1)
-    ).mean()
+    return mean_square(offsets.offsets)
 
 
 def residual(change: Float[Tensor, "gaussian 4"]) -> Tensor:
     """Mean squared appearance residual (Delta c, Delta o), Eq. 18."""
-    return change.square().sum(-1).mean()
+    return mean_square(change)
 
 
 def rigidity(lengths: Float[Tensor, "instant pair"], weights: Float[Tensor, " pair"]) -> Tensor:
@@ -52,3 +52,24 @@ def rigidity(lengths: Float[Tensor, "instant pair"], weights: Float[Tensor, " pa
     strain = (lengths - mean) / mean.detach()
     cost = (strain.square() + SLIGHT_STRAIN**2).sqrt() - SLIGHT_STRAIN
     return (cost.mean(0) * weights).sum() / weights.sum().clamp_min(1.0)
+
+
+def mean_square(rows: Float[Tensor, "row _"]) -> Tensor:
+    """Mean over at least one row of its squared length."""
+    return torch.as_tensor(_SquaredLength.apply(rows)) / len(rows)  # type: ignore[no-untyped-call]
+
+
+class _SquaredLength(torch.autograd.Function):
+    """Sum of squares; as square().sum() it goes through memory five times on its way back, and it is asked often."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        ctx.save_for_backward(values)
+        return torch.linalg.vector_norm(values.detach()).square()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
+        (values,) = ctx.saved_tensors
+        gradient: Tensor = values * (2 * upstream[0])
+        return gradient

@@ -27,7 +27,7 @@ REACH = 30
 # closer ones the length is rounding.
 NEAREST, FARTHEST = 1e-3, 0.2
 
-# The temporal term looks at no fewer children than this (decision 10).
+# The temporal term looks at no fewer children than about this (decision 10).
 MIN_TEMPORAL_SAMPLE = 2_000
 
 
@@ -77,8 +77,8 @@ def _temporal(
     side = 1 if int(torch.randint(2, (1,), generator=generator)) else -1
     there = here + side if 0 <= here + side < len(times) else here - side
     count = len(composition.children)
-    size = min(count, max(MIN_TEMPORAL_SAMPLE, int(share * count)))
-    sample = torch.randperm(count, generator=generator)[:size].sort().values
+    share = max(share, MIN_TEMPORAL_SAMPLE / count)
+    sample = (torch.rand(count, generator=generator) < share).nonzero().squeeze(-1)
     neighbour = scene.deform(composition.children[sample], composition.canonical_means[sample], float(times[there]))
     assert neighbour is not None
     gap = abs(float(times[there] - times[here]))

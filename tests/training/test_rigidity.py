@@ -32,10 +32,8 @@ def placed(compositions: list[Composition], places: list[Tensor]) -> list[Compos
     """The compositions with their children moved to `places`."""
     moved = []
     for one, where in zip(compositions, places, strict=True):
-        offset = Deformation(
-            where - one.canonical_means.detach(), torch.zeros(len(where), 4), torch.zeros(len(where), 3)
-        )
-        moved.append(dataclasses.replace(one, deformation=offset))
+        offsets = torch.cat([where - one.canonical_means.detach(), torch.zeros(len(where), 7)], dim=1)
+        moved.append(dataclasses.replace(one, deformation=Deformation(offsets)))
     return moved
 
 
