@@ -96,6 +96,7 @@ def _rigidity(compositions: Sequence[Composition], extent: float, generator: tor
     gaps = [((places := canonical + offset)[step:] - places[:-step]) / extent for offset in offsets]
     lengths = torch.stack([(gap.square().sum(-1) + NEAREST**2 / 4).sqrt() for gap in gaps])
     mean = lengths.detach().mean(0)
-    opacities = torch.stack([one.gaussians.opacities.detach() for one in compositions]).amin(0)
+    # A child that another view draws may be below zero in this one, and a negative weight would reward strain.
+    opacities = torch.stack([one.gaussians.opacities.detach() for one in compositions]).amin(0).clamp_min(0.0)
     weights = torch.minimum(opacities[step:], opacities[:-step]) * ((mean > NEAREST) & (mean < FARTHEST))
     return losses.rigidity(lengths, weights)

@@ -54,6 +54,21 @@ def test_rigid_motion_costs_nothing_and_bending_does() -> None:
     assert float(strain(scene, placed(compositions, bent))) > 1e-2
 
 
+def test_children_that_are_nothing_at_one_instant_have_no_say() -> None:
+    """Composed together, a child may be drawn in one view and be below zero in another; strain is no gain there."""
+    scene = tiny_scene(anchors=60)
+    compositions = together(scene)
+    canonical = compositions[0].canonical_means.detach()
+    apart = placed(compositions, [canonical * (1 + time) for time in TIMES.tolist()])
+    gaussians = apart[2].gaussians
+    faded = dataclasses.replace(gaussians, opacities=gaussians.opacities.detach() * 0 - 0.05)
+    apart[2] = dataclasses.replace(apart[2], gaussians=faded)
+    assert float(strain(scene, apart)) == 0.0
+    faded = dataclasses.replace(gaussians, opacities=torch.where(torch.arange(len(canonical)) % 2 == 0, -0.05, 0.5))
+    apart[2] = dataclasses.replace(apart[2], gaussians=faded)
+    assert float(strain(scene, apart)) > 0.0
+
+
 def test_the_strain_of_a_stretched_pair_is_its_share_of_the_mean_length() -> None:
     lengths = torch.tensor([[0.8, 1.0, 7.0], [1.2, 1.0, 9.0]])
     weights = torch.tensor([0.5, 1.0, 0.0])
