@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from graings.errors import CheckpointError, ConfigError
 
 PAPER_ITERATIONS = 30_000
+DEEPEST = 8  # more levels than any option has
 
 
 class Part(BaseModel):
@@ -308,16 +309,18 @@ def _problems(error: ValidationError) -> str:
     return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
 
 
-def _merge(into: dict[str, Any], values: dict[str, Any]) -> None:
+def _merge(into: dict[str, Any], values: dict[str, Any], depth: int = 0) -> None:
     for key, value in values.items():
         head, _, rest = key.partition(".")
+        if depth > DEEPEST:
+            raise ConfigError(f"{head[:40]}: no option has so many parts. `graings options` lists every field.")
         if rest:
             value = {rest: value}
         if isinstance(value, dict):
             child = into.setdefault(head, {})
             if not isinstance(child, dict):
                 raise ConfigError(f"{head}: is a value, it has no part {next(iter(value))!r}.")
-            _merge(child, value)
+            _merge(child, value, depth + 1)
         else:
             into[head] = value
 

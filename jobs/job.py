@@ -55,6 +55,10 @@ class JobNotFound(JobError):
         super().__init__(f"There is no job {job_id!r}. The list of jobs has every id.")
 
 
+class JobDamaged(JobError):
+    """What is stored of a job cannot be read."""
+
+
 class JobConflict(JobError):
     """The job's state forbids what was asked of it."""
 
@@ -119,8 +123,13 @@ class Job:
     error: str | None
 
 
+def is_id(name: str) -> bool:
+    """Whether this has the form of an id."""
+    return _ID.fullmatch(name) is not None
+
+
 def check_id(job_id: str) -> str:
     """The id itself when it has the form of one, so that it is safe in a path. Raises `JobNotFound`."""
-    if not _ID.fullmatch(job_id):
+    if not is_id(job_id):
         raise JobNotFound(job_id)
     return job_id

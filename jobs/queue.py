@@ -6,12 +6,20 @@ what its state allows. Holds no state of its own: any number of processes may ha
 
 from __future__ import annotations
 
+import logging
+from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
 from jobs.engine import Engine, Ticket
-from jobs.job import Job, JobConflict, JobSpec, JobState
+from jobs.job import Attempt, Job, JobConflict, JobDamaged, JobNotFound, JobSpec, JobState
 from jobs.progress import last_progress
 from jobs.store import Store
+
+LOG = logging.getLogger(__name__)
+
+# Stands for what was asked for where that cannot be read.
+UNREADABLE: Final = JobSpec(name="unreadable", capture="", config={})
 
 
 class JobQueue:
@@ -27,12 +35,22 @@ class JobQueue:
         known = self._engine.tickets(ids)
         for job_id in ids:
             if job_id not in known:
-                self._engine.enqueue(job_id, self.store.folder(job_id).spec().priority)
+                try:
+                    priority = self.store.folder(job_id).spec().priority
+                except JobDamaged as error:
+                    LOG.warning("%s", error)  # it is listed as failed, with these words
+                    continue
+                self._engine.enqueue(job_id, priority)
 
     def submit(self, spec: JobSpec, unpacked: Path) -> Job:
         """A new job on the capture in the folder `unpacked`, which moves into the store."""
         job_id = self.store.create(spec, unpacked)
-        self._engine.enqueue(job_id, spec.priority)
+        try:
+            self._engine.enqueue(job_id, spec.priority)
+        except BaseException:
+            # Who is told that it went wrong will send it again.
+            self.store.delete(job_id)
+            raise
         return self.get(job_id)
 
     def get(self, job_id: str) -> Job:
@@ -44,7 +62,10 @@ class JobQueue:
         ids = [job_id for job_id in self.store.ids() if after is None or job_id < after]
         chosen = ids[:limit]
         tickets = self._engine.tickets(chosen)
-        jobs = [self._job(job_id, tickets.get(job_id)) for job_id in chosen]
+        jobs = []
+        for job_id in chosen:
+            with suppress(JobNotFound):  # deleted meanwhile
+                jobs.append(self._job(job_id, tickets.get(job_id)))
         return jobs, (chosen[-1] if len(ids) > limit else None)
 
     def cancel(self, job_id: str) -> Job:
@@ -93,11 +114,18 @@ class JobQueue:
 
     def _job(self, job_id: str, ticket: Ticket | None) -> Job:
         folder = self.store.folder(job_id)
-        attempts = folder.attempts()
+        state = JobState.QUEUED if ticket is None else ticket.state
+        error = None if ticket is None else ticket.error
+        spec, attempts = UNREADABLE, list[Attempt]()
+        try:
+            spec, attempts = folder.spec(), folder.attempts()
+        except JobDamaged as damage:
+            # One bad file must not hide the other jobs, nor keep anybody from deleting this one.
+            state, error = JobState.FAILED if ticket is None else state, str(damage)
         return Job(
             id=job_id,
-            spec=folder.spec(),
-            state=JobState.QUEUED if ticket is None else ticket.state,
+            spec=spec,
+            state=state,
             created_at=folder.created_at(),
             started_at=attempts[0].started_at if attempts else None,
             finished_at=None if ticket is None else ticket.finished_at,
@@ -106,5 +134,5 @@ class JobQueue:
             checkpoint=folder.checkpoint(),
             has_metrics=folder.metrics.exists(),
             has_model=folder.model.exists(),
-            error=None if ticket is None else ticket.error,
+            error=error,
         )

@@ -11,7 +11,6 @@ Every file appears whole or not at all. The store knows nothing of queues: wheth
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import time
 import uuid
@@ -19,13 +18,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from graings.run_folder import MODEL_FILE, newest_checkpoint
 from jobs.files import locked, write_json
-from jobs.job import Attempt, JobConflict, JobError, JobNotFound, JobSpec, check_id
+from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
 
 KEPT_ATTEMPTS = 50
+LEFTOVER_S = 86_400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,19 +66,18 @@ class JobFolder:
         return self.run / MODEL_FILE
 
     def spec(self) -> JobSpec:
-        return JobSpec(**self._record()["spec"])
+        """What was asked for. Raises `JobDamaged`, and `JobNotFound` for a job that was deleted meanwhile."""
+        file = self.path / "job.json"
+        try:
+            return JobSpec(**json.loads(file.read_text())["spec"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            if not self.path.is_dir():
+                raise JobNotFound(self.path.name) from error
+            raise JobDamaged(f"{file}: not readable ({error!r}). Delete the job and send its capture again.") from error
 
     def created_at(self) -> float:
-        return float(self._record()["created_at"])
-
-    def _record(self) -> dict[str, Any]:
-        try:
-            record: dict[str, Any] = json.loads((self.path / "job.json").read_text())
-        except FileNotFoundError as error:
-            raise JobNotFound(self.path.name) from error
-        except ValueError as error:
-            raise JobError(f"{self.path / 'job.json'}: not readable ({error}). Delete the job.") from error
-        return record
+        """Unix seconds; ids begin with them."""
+        return int(self.path.name[:11], 16) / 1000.0
 
     def checkpoint(self) -> int | None:
         """The iteration of the newest checkpoint, or None."""
@@ -88,10 +86,13 @@ class JobFolder:
 
     def attempts(self) -> list[Attempt]:
         """The last starts of the trainer, oldest first."""
+        file = self.path / "attempts.json"
         try:
-            return [Attempt(**values) for values in json.loads((self.path / "attempts.json").read_text())]
+            return [Attempt(**values) for values in json.loads(file.read_text())]
         except FileNotFoundError:
             return []
+        except (OSError, ValueError, TypeError) as error:
+            raise JobDamaged(f"{file}: not readable ({error!r}). Remove that file; only a count is lost.") from error
 
     def begin_attempt(self, worker: str) -> Attempt:
         """Record a start, before it happens: a start that kills its worker counts too."""
@@ -141,10 +142,14 @@ class Store:
         job_id = f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
         with self._changing():
             capture = self._captures / spec.capture
-            if capture.exists():
+            if _files(capture) == _files(unpacked):
                 shutil.rmtree(unpacked)
             else:
+                # New, or a file of it was lost since: what has just arrived is whole.
+                if capture.exists():
+                    capture.rename(self.uploads / f"{job_id}.replaced")
                 unpacked.rename(capture)
+                shutil.rmtree(self.uploads / f"{job_id}.replaced", ignore_errors=True)
             # The record is written first and the folder renamed last: a folder in jobs/ always has its record.
             part = self.uploads / f"{job_id}.job"
             part.mkdir()
@@ -160,8 +165,9 @@ class Store:
         return JobFolder(path)
 
     def ids(self) -> list[str]:
-        """All jobs, newest first: ids begin with the time."""
-        return sorted(os.listdir(self._jobs), reverse=True)
+        """All jobs, newest first: ids begin with the time. What else lies in their folder is none of ours."""
+        found = [one.name for one in self._jobs.iterdir() if is_id(one.name) and one.is_dir()]
+        return sorted(found, reverse=True)
 
     def delete(self, job_id: str) -> None:
         """Remove a job, and its capture when no other job uses it. Raises `JobConflict` while its trainer is at it."""
@@ -169,15 +175,37 @@ class Store:
         with self._changing(), locked(folder.lock, wait=False) as free:
             if not free:
                 raise JobConflict(f"Job {job_id} is still writing its checkpoint. Try again in a few seconds.")
-            digest = folder.spec().capture
             bin_ = self.uploads / f"{job_id}.deleted"
             folder.path.rename(bin_)
             shutil.rmtree(bin_)
-            if all(self.folder(other).spec().capture != digest for other in self.ids()):
-                shutil.rmtree(self._captures / digest, ignore_errors=True)
+            try:
+                used = {self.folder(other).spec().capture for other in self.ids()}
+            except JobDamaged:
+                return  # a capture that nobody seems to use may be that job's
+            for capture in self._captures.iterdir():
+                if capture.name not in used:
+                    shutil.rmtree(capture, ignore_errors=True)
+
+    def discard_leftovers(self) -> None:
+        """Remove what processes that died left in uploads/. What is younger may still be on its way."""
+        for one in self.uploads.iterdir():
+            try:
+                if time.time() - one.lstat().st_mtime < LEFTOVER_S:
+                    continue
+                if one.is_dir():
+                    shutil.rmtree(one)
+                else:
+                    one.unlink()
+            except FileNotFoundError:
+                continue  # another process was faster
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
         """One at a time adds or removes jobs and captures, whichever process it is in."""
         with locked(self.root / "store.lock"):
             yield
+
+
+def _files(folder: Path) -> dict[str, int]:
+    """Sizes of the files below a folder, by path; none where it is missing."""
+    return {str(one.relative_to(folder)): one.stat().st_size for one in folder.rglob("*") if one.is_file()}

@@ -6,6 +6,8 @@ about itself is not believed. Knows nothing of captures or HTTP.
 
 from __future__ import annotations
 
+import errno
+import gzip
 import lzma
 import os
 import shutil
@@ -38,7 +40,11 @@ _BROKEN = (
     RuntimeError,
     UnicodeError,
     ValueError,
+    IndexError,
+    gzip.BadGzipFile,
 )
+# What reading says of a place that a damaged header points to; a full disk is no fault of the archive.
+_NOWHERE = (errno.EINVAL, errno.EOVERFLOW)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +81,10 @@ def unpack(archive: Path, folder: Path, limits: Limits) -> Unpacked:
     except _BROKEN as error:
         shutil.rmtree(folder)
         raise ArchiveError(f"The archive is damaged: {error}. Pack the capture again.") from error
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(folder)
+        if isinstance(error, OSError) and error.errno in _NOWHERE:
+            raise ArchiveError(f"The archive is damaged: {error}. Pack the capture again.") from error
         raise
 
 

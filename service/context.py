@@ -48,6 +48,7 @@ class Context:
 def open_context(settings: Settings) -> Context:
     """Open the store and the database and pick up what an earlier process left half done."""
     store = Store(settings.data)
+    store.discard_leftovers()
     engine = Engine(settings.database_url)
     jobs = JobQueue(store, engine)
     jobs.adopt_strays()

@@ -18,7 +18,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse, Response
 
 from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError
-from jobs.job import JobConflict, JobError, JobNotFound
+from jobs.job import JobConflict, JobDamaged, JobError, JobNotFound
 
 LOG = logging.getLogger(__name__)
 
@@ -75,6 +75,7 @@ class Busy(ServiceError):
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (JobNotFound, 404, "no-such-job"),
     (JobConflict, 409, "state-conflict"),
+    (JobDamaged, 500, "job-damaged"),
     (JobError, 503, "jobs-unavailable"),
     (BadRequest, 422, "bad-parameter"),
     (ArchiveError, 422, "capture-rejected"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, ValidationError
 
 from jobs.job import Job, JobState
 
@@ -89,13 +89,21 @@ def job_resource(job: Job) -> JobResource:
         started_at=None if job.started_at is None else _moment(job.started_at),
         finished_at=None if job.finished_at is None else _moment(job.finished_at),
         attempts=job.attempts,
-        progress=None if job.progress is None else ProgressResource.model_validate(job.progress),
+        progress=None if job.progress is None else _progress(job.progress),
         checkpoint=job.checkpoint,
         error=job.error,
         capture=job.spec.capture,
         config=job.spec.config,
         links=links,
     )
+
+
+def _progress(report: dict[str, Any]) -> ProgressResource | None:
+    """A report as a resource; None for a line that lacks what every report has, until the next one comes."""
+    try:
+        return ProgressResource.model_validate(report)
+    except ValidationError:
+        return None
 
 
 def _moment(seconds: float) -> datetime:

@@ -44,7 +44,7 @@ async def receive_capture(request: Request, uploads: Path, limits: Limits) -> As
     name = uuid.uuid4().hex
     archive, folder = uploads / f"{name}.part", uploads / name
     try:
-        if request.headers.get("content-type", "").startswith("multipart/form-data"):
+        if request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
             async with request.form(max_files=1, max_fields=1) as form:
                 config = _config_field(form)
                 digest = await _store_file(_capture_field(form), archive)
@@ -62,7 +62,7 @@ def parse_config(text: str, where: str) -> dict[str, Any]:
     """A JSON object of options. Raises `BadRequest` naming `where` it was given."""
     try:
         value = json.loads(text, parse_constant=_refuse_constant)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BadRequest(f"{where}: not JSON ({error}). Give an object of options, see /options.") from error
     if not isinstance(value, dict):
         raise BadRequest(f"{where}: must be a JSON object of options, see /options.")

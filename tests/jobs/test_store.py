@@ -1,12 +1,13 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from jobs.exit_code import ExitCode
 from jobs.files import locked
-from jobs.job import JobConflict, JobNotFound, JobSpec
+from jobs.job import JobConflict, JobDamaged, JobNotFound, JobSpec
 from jobs.store import Store
 
 DIGEST = "ab" * 32
@@ -74,3 +75,58 @@ def test_attempts_are_counted_before_they_can_fail(tmp_path: Path) -> None:
     second = folder.begin_attempt("worker-b")
     assert [(one.number, one.exit_code, one.message) for one in folder.attempts()] == [(1, 1, "boom"), (2, None, None)]
     assert second.checkpoint == 0
+
+
+def test_what_is_no_job_is_none_of_the_stores(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    job_id = store.create(spec(), unpacked(store, "u", "a.json"))
+    (tmp_path / "jobs" / ".DS_Store").write_text("")
+    (tmp_path / "jobs" / "0123456789abcdef").write_text("a file with the name of a job")
+    (tmp_path / "jobs" / "notes").mkdir()
+    assert store.ids() == [job_id]
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"spec": 3}', '{"spec": {"name": "a"}}', None])
+def test_a_job_that_cannot_be_read_says_so_and_can_be_deleted(tmp_path: Path, content: str | None) -> None:
+    store = Store(tmp_path)
+    damaged = store.create(spec(capture="cd" * 32), unpacked(store, "u", "a.json"))
+    whole = store.create(spec(), unpacked(store, "v", "a.json"))
+    record = store.folder(damaged).path / "job.json"
+    record.unlink() if content is None else record.write_text(content)
+    with pytest.raises(JobDamaged, match=r"job\.json.*Delete the job"):
+        store.folder(damaged).spec()
+    other = store.create(spec(), unpacked(store, "w", "a.json"))
+    store.delete(other)  # a damaged neighbour keeps nobody from it, and what may be its capture stays
+    assert len(list((tmp_path / "captures").iterdir())) == 2
+    store.delete(damaged)
+    assert store.ids() == [whole]
+    assert [one.name for one in (tmp_path / "captures").iterdir()] == [DIGEST]
+
+
+def test_damaged_attempts_name_their_file(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    folder = store.folder(store.create(spec(), unpacked(store, "u", "a.json")))
+    (folder.path / "attempts.json").write_text('[{"no": 1}]')
+    with pytest.raises(JobDamaged, match=r"attempts\.json.*Remove that file"):
+        folder.attempts()
+
+
+def test_a_capture_that_lost_a_file_is_replaced_by_the_same_upload(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.create(spec(), unpacked(store, "u", "a.json", "b.png"))
+    (store.capture(DIGEST) / "b.png").unlink()
+    store.create(spec(), unpacked(store, "v", "a.json", "b.png"))
+    assert (store.capture(DIGEST) / "b.png").read_text() == "b.png"
+    assert list(store.uploads.iterdir()) == []
+
+
+def test_what_dead_processes_left_goes_after_a_day(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for name in ("old", "young"):
+        (store.uploads / f"{name}.part").write_text("")
+        unpacked(store, name, "a.json")
+        for one in (store.uploads / f"{name}.part", store.uploads / name):
+            if name == "old":
+                os.utime(one, (0, 0))
+    store.discard_leftovers()
+    assert sorted(one.name for one in store.uploads.iterdir()) == ["young", "young.part"]

@@ -1,0 +1,80 @@
+"""What the store holds of one job is damaged: the others are served, and the damaged one can be seen and deleted."""
+
+from __future__ import annotations
+
+import pytest
+from starlette.testclient import TestClient
+
+from jobs.engine import Engine
+from jobs.job import JobError
+from service.app import create_app
+from service.settings import Settings
+
+
+@pytest.fixture
+def second(client: TestClient, job: str, archive: bytes) -> str:
+    answer = client.post("/jobs", params={"preset": "draft", "name": "second"}, content=archive)
+    return str(answer.json()["id"])
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [("job.json", "{"), ("job.json", "[]"), ("attempts.json", "{"), ("attempts.json", '[{"x": 1}]')],
+)
+def test_one_damaged_job_hides_no_other(
+    client: TestClient, settings: Settings, job: str, second: str, file: str, content: str
+) -> None:
+    (settings.data / "jobs" / job / file).write_text(content)
+    listed = {one["id"]: one for one in client.get("/jobs").json()["jobs"]}
+    assert set(listed) == {job, second}
+    assert file in listed[job]["error"]
+    assert listed[second]["error"] is None
+    assert client.get(f"/jobs/{job}").status_code == 200
+    assert client.delete(f"/jobs/{second}").status_code == 204
+    assert client.delete(f"/jobs/{job}").status_code == 204
+    assert client.get("/jobs").json()["jobs"] == []
+    assert list((settings.data / "captures").iterdir()) == []
+
+
+@pytest.mark.parametrize("line", ["{}", '{"phase": 3}', '{"phase": "joint", "iteration": "many"}'])
+def test_a_report_that_lacks_what_reports_have_is_passed_over(
+    client: TestClient, settings: Settings, job: str, line: str
+) -> None:
+    (settings.data / "jobs" / job / "progress.jsonl").write_text(line + "\n")
+    assert client.get(f"/jobs/{job}").json()["progress"] is None
+
+
+def test_a_service_starts_with_damaged_jobs_and_strange_files(settings: Settings, archive: bytes) -> None:
+    with TestClient(create_app(settings)) as client:
+        damaged, whole = (client.post("/jobs", content=archive).json()["id"] for _ in range(2))
+    (settings.data / "jobs" / ".DS_Store").write_text("")
+    (settings.data / "jobs" / damaged / "job.json").unlink()
+    for file in settings.data.glob("*.sqlite*"):
+        file.unlink()  # the queue forgot both
+    with TestClient(create_app(settings)) as client:
+        states = {one["id"]: one["state"] for one in client.get("/jobs").json()["jobs"]}
+        assert states == {damaged: "failed", whole: "queued"}
+        assert client.delete(f"/jobs/{damaged}").status_code == 204
+
+
+def test_a_job_that_could_not_be_queued_leaves_nothing(
+    client: TestClient, settings: Settings, archive: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_: object) -> None:
+        raise JobError("The job database is away. Start it.")
+
+    monkeypatch.setattr(Engine, "enqueue", away)
+    answer = client.post("/jobs", content=archive)
+    assert answer.status_code == 503
+    assert "Start it" in answer.json()["detail"]
+    assert client.get("/jobs").json()["jobs"] == []
+    assert list((settings.data / "captures").iterdir()) == []
+
+
+def test_an_image_that_the_store_lost_comes_back_with_the_same_upload(
+    client: TestClient, settings: Settings, job: str, archive: bytes
+) -> None:
+    images = sorted((settings.data / "captures").rglob("*.png"))
+    images[0].unlink()
+    assert client.post("/jobs", content=archive).status_code == 202
+    assert sorted((settings.data / "captures").rglob("*.png")) == images
