@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 from safetensors import SafetensorError
@@ -34,6 +35,11 @@ from graings.units import Units
 
 FORMAT = "graings.checkpoint/1"
 KEEP = 2
+
+LOG = logging.getLogger(__name__)
+Read = TypeVar("Read")
+
+_LEFT = "an earlier checkpoint is used if there is one, else train again"
 
 _SCENE_FILE = "scene.safetensors"
 _STATE_FILE = "state.safetensors"
@@ -116,40 +122,58 @@ def save_checkpoint(
 
 
 def load_model(path: Path) -> Model:
-    """The model in a run folder (its newest checkpoint) or in a checkpoint folder. Raises `CheckpointError`."""
-    folder = _resolve(path)
+    """The model in a checkpoint folder, or in the newest checkpoint of a run folder that can be read.
+
+    Raises `CheckpointError`.
+    """
+    return _newest_readable(path, _model)
+
+
+def load_training(path: Path) -> tuple[Model, TrainingState]:
+    """As `load_model`, with what the trainer stored beside the model: both of the same checkpoint."""
+    return _newest_readable(path, lambda folder: (_model(folder), load_state(folder)))
+
+
+def load_state(folder: Path) -> TrainingState:
+    """What the trainer stored in a checkpoint folder. Raises `CheckpointError`."""
+    try:
+        return TrainingState(load_file(folder / _STATE_FILE), _read_facts(folder)["state"])
+    except (OSError, SafetensorError, KeyError) as error:
+        raise CheckpointError(f"{folder}: damaged training state ({error!r}). Remove this folder; {_LEFT}.") from error
+
+
+def _model(folder: Path) -> Model:
     facts = _read_facts(folder)
     try:
         return model_from(facts, load_file(folder / _SCENE_FILE), facts["digest"], folder)
     except (OSError, SafetensorError, ValidationError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f"{folder}: damaged checkpoint ({error}). Use an earlier one or train again.") from error
+        raise CheckpointError(f"{folder}: damaged checkpoint ({error!r}). Remove this folder; {_LEFT}.") from error
 
 
-def load_state(path: Path) -> TrainingState:
-    """What the trainer stored beside the model. Raises `CheckpointError`."""
-    folder = _resolve(path)
-    try:
-        return TrainingState(load_file(folder / _STATE_FILE), _read_facts(folder)["state"])
-    except (OSError, SafetensorError, KeyError) as error:
-        raise CheckpointError(
-            f"{folder}: damaged training state ({error}). Resume from an earlier checkpoint."
-        ) from error
-
-
-def _resolve(path: Path) -> Path:
+def _newest_readable(path: Path, read: Callable[[Path], Read]) -> Read:
+    """`read` of a checkpoint folder, or of a run's newest one that is whole; what is passed over is said in the log."""
     if (path / FACTS_FILE).is_file():
-        return path
-    newest = newest_checkpoint(path)
-    if newest is None:
-        raise CheckpointError(f"{path}: no checkpoint here. Give a run folder that has trained for a while.")
-    return newest
+        return read(path)
+    first: CheckpointError | None = None
+    for folder in reversed(checkpoints(path)):
+        try:
+            found = read(folder)
+        except CheckpointError as error:
+            first = first or error
+            continue
+        if first is not None:
+            LOG.warning("%s Going on with %s.", first, folder)
+        return found
+    if first is not None:
+        raise first
+    raise CheckpointError(f"{path}: no checkpoint here. Give a run folder that has trained for a while.")
 
 
 def _read_facts(folder: Path) -> dict[str, Any]:
     try:
         facts = json.loads((folder / FACTS_FILE).read_text())
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"{folder / FACTS_FILE}: not readable ({error}). Use an earlier checkpoint.") from error
+        raise CheckpointError(f"{folder / FACTS_FILE}: not readable ({error}). Remove this folder; {_LEFT}.") from error
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         raise CheckpointError(f"{folder / FACTS_FILE}: not in the format {FORMAT}. It was written by another version.")
     return facts

@@ -52,7 +52,10 @@ EPILOG: Final = (
     "SIGTERM), for training with a checkpoint to resume from."
 )
 
-Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or one of its checkpoints.")]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
+Shown = Annotated[
+    Path, typer.Argument(metavar="RUN", help="Folder of a run, one of its checkpoints, or an exported .graings file.")
+]
 
 
 class Verbs(typer.core.TyperGroup):
@@ -83,7 +86,7 @@ app.command(cls=Lists)(ablate)
 
 @app.command(name="render")
 def render_view(
-    run: Run,
+    run: Shown,
     output: Annotated[Path, typer.Option("--output", "-o", help="Image file: .png, .jpg, .webp or .exr.")],
     t: Annotated[float | None, typer.Option(help="Time from 0 to 1; left out: that of --camera, or 0.")] = None,
     camera: Annotated[str | None, typer.Option(help="A view of the capture, such as test:3.")] = None,
@@ -139,7 +142,7 @@ def render_view(
 
 @app.command()
 def export(
-    run: Run,
+    run: Shown,
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write, such as scene{SUFFIX}.")],
 ) -> None:
     """Write a model as one small file that `graings render` takes in place of the run."""

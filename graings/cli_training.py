@@ -61,6 +61,7 @@ def train(
             raise typer.BadParameter("say which capture to train on", param_hint="CAPTURE")
         overrides = dict(_setting(text) for text in settings or ())
         if preset is not None:
+            _once(preset, overrides)
             overrides["preset"] = preset
         if threads is not None:
             overrides["threads"] = threads
@@ -96,6 +97,8 @@ def ablate(
     The same command again continues where it stopped; more rows and seeds can be added later.
     """
     overrides = dict(_setting(text) for text in settings or ())
+    if preset is not None:
+        _once(preset, overrides)
     named = str(overrides.pop("preset", "standard"))
     ablation = Ablation(
         *(output, capture),
@@ -105,6 +108,8 @@ def ablate(
         seeds=seeds or (0, 1, 2),
         threads=threads,
     )
+    for note in ablation.notes:
+        say(note)
     left = len(ablation.pending())
     say(f"{len(ablation.jobs)} runs, {len(ablation.jobs) - left} of them finished.")
     for job, run in ablation:
@@ -122,6 +127,11 @@ def ablate(
         if mean is not None:
             say(f"{row['label']:>22}  {mean:.2f} dB" + (f"  {signed(difference)}" if difference is not None else ""))
     say(f"The table is in {output / 'ablation.md'}, with ablation.json and ablation.svg beside it.")
+
+
+def _once(preset: str, overrides: dict[str, Any]) -> None:
+    if overrides.get("preset", preset) != preset:
+        raise typer.BadParameter(f"the preset is {preset} and {overrides['preset']}; give one of --preset and --set")
 
 
 def _take_steps(run: TrainingRun) -> Interrupt:

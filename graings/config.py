@@ -8,7 +8,7 @@ run keeps its shape. Knows nothing of how the numbers are used.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -26,6 +26,13 @@ class Part(BaseModel):
 
 Stored = TypeVar("Stored", bound=Part)
 
+# What an older file does not say of a model's shape is as it was before there was a choice.
+SHAPE_BEFORE: Final[dict[str, Any]] = {"deform_time": "input", "time_width": 64, "direction_degree": 1}
+
+
+Channel = Annotated[float, Field(ge=0, le=1)]
+FirstAndLast = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
+
 
 class CaptureConfig(Part):
     """How images are read. Owner: `graings.capture`."""
@@ -33,7 +40,7 @@ class CaptureConfig(Part):
     max_side: int | None = Field(
         400, ge=16, le=16384, description="Longest image side in px; null keeps the files' size."
     )
-    background: Literal["white", "black"] | tuple[float, float, float] = Field(
+    background: Literal["white", "black"] | tuple[Channel, Channel, Channel] = Field(
         "white", description="Colour behind transparent pixels: white, black or [r, g, b] in [0, 1]."
     )
     times_from_names: bool = Field(False, description="COLMAP: take times from the number in the file name.")
@@ -94,7 +101,7 @@ class InitConfig(Part):
     carve_vote: float = Field(0.6, ge=0, le=1, description="Share of views whose mask a random point must hit to stay.")
     max_points: int = Field(60_000, ge=16, description="At most this many points of a given cloud are used.")
     voxel_size: float | None = Field(
-        None, gt=0, description="Finest anchor cell, normalised; null: 0.7 pixel footprints."
+        None, ge=1e-9, description="Finest anchor cell, normalised; null: 0.7 pixel footprints."
     )
     offset_std: float = Field(0.3, ge=0, le=10, description="Spread of the first child offsets in units of s_a.")
     opacity: float = Field(0.1, gt=0.004, lt=0.99, description="Opacity score that all children start with.")
@@ -156,16 +163,16 @@ class RatesConfig(Part):
     They are Adam's; `matrices` is that of the matrices in `static` and `deformation` unless `matrix_step` is adam.
     """
 
-    offsets: tuple[float, float] = (0.02, 2e-4)
-    features: tuple[float, float] = (0.0075, 0.0015)
-    log_scales: tuple[float, float] = (0.007, 0.0014)
-    opacity_offsets: tuple[float, float] = (0.02, 0.002)
-    static: tuple[float, float] = (0.004, 0.0004)
-    color: tuple[float, float] = (0.008, 5e-5)
-    opacity: tuple[float, float] = (0.002, 2e-5)
-    residual: tuple[float, float] = (0.002, 2e-5)
-    deformation: tuple[float, float] = (2e-3, 5e-5)
-    matrices: tuple[float, float] = (2e-3, 5e-5)
+    offsets: FirstAndLast = (0.02, 2e-4)
+    features: FirstAndLast = (0.0075, 0.0015)
+    log_scales: FirstAndLast = (0.007, 0.0014)
+    opacity_offsets: FirstAndLast = (0.02, 0.002)
+    static: FirstAndLast = (0.004, 0.0004)
+    color: FirstAndLast = (0.008, 5e-5)
+    opacity: FirstAndLast = (0.002, 2e-5)
+    residual: FirstAndLast = (0.002, 2e-5)
+    deformation: FirstAndLast = (2e-3, 5e-5)
+    matrices: FirstAndLast = (2e-3, 5e-5)
 
 
 class GuardConfig(Part):
@@ -300,9 +307,15 @@ def restored_training(values: Any, source: Path) -> TrainConfig:
     if isinstance(values, dict):
         before = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS, "time_window": 1.0, "batch": 1}
         values = before | values
-        if isinstance(values.get("loss"), dict):
-            values["loss"] = {"rigidity": 0.0} | values["loss"]
+        for part, earlier in (("loss", {"rigidity": 0.0}), ("scene", SHAPE_BEFORE)):
+            if isinstance(values.get(part), dict):
+                values[part] = earlier | values[part]
     return restored(TrainConfig, values, source)
+
+
+def restored_shape(values: Any, source: Path) -> SceneConfig:
+    """As `restored_training`, for the shape of a model."""
+    return restored(SceneConfig, SHAPE_BEFORE | values if isinstance(values, dict) else values, source)
 
 
 def _problems(error: ValidationError) -> str:

@@ -6,7 +6,6 @@ Knows nothing of training.
 from __future__ import annotations
 
 import hashlib
-import json
 import statistics
 import time
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from graings.errors import CheckpointError
 from graings.metrics import Lpips, SplitMetrics, measure
 from graings.render import render
 from graings.report import read_metrics, write_metrics
+from graings.run_folder import read_record
 from graings.scene.scene import Scene
 
 
@@ -66,9 +66,9 @@ def evaluate_run(run: Path, split: str, capture: Path | None = None) -> SplitMet
     no model or the capture is not the one it was trained on.
     """
     model = load_model(run)
-    facts = json.loads((run / "run.json").read_text())
-    data = load_capture(capture or Path(facts["capture"]["path"]), model.config.capture)
-    if data.content_hash != facts["capture"]["hash"]:
+    record = read_record(run)
+    data = load_capture(capture or record.capture, model.config.capture)
+    if data.content_hash != record.capture_hash:
         raise CheckpointError(
             f"{data.root}: not the capture this run was trained on. Give the original with --capture."
         )
@@ -76,6 +76,8 @@ def evaluate_run(run: Path, split: str, capture: Path | None = None) -> SplitMet
     images = ImageStore(model.background, model.config.capture.cache_mb)
     metrics = evaluate(model.scene, frames, images, model.background, lpips=Lpips.find())
     document = read_metrics(run / "metrics.json")
+    if not isinstance(document.get("splits"), dict):
+        raise CheckpointError(f"{run / 'metrics.json'}: has no `splits`. Finish the training run again (--resume).")
     document["splits"][split] = metrics.to_json()
     write_metrics(run / "metrics.json", document)
     return metrics

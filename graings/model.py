@@ -8,19 +8,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 
 from graings.camera import Camera, View
-from graings.config import SceneConfig, TrainConfig, restored, restored_training
+from graings.config import TrainConfig, restored_shape, restored_training
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.units import Units
-
-# What the facts of a model do not say is as it was before there was a choice.
-BEFORE: Final = {"deform_time": "input", "time_width": 64, "direction_degree": 1}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +69,7 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
     Raises `CheckpointError` for options of another version, and whatever broken facts provoke.
     """
     config = restored_training(facts["config"], path)
-    shape = restored(SceneConfig, BEFORE | facts["scene_config"], path)
+    shape = restored_shape(facts["scene_config"], path)
     rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
     scene = Scene(shape, Scaffold(**rows), extent=float(tensors["extent"]), initial_opacity=0.1)
     scene.load_state_dict(tensors)

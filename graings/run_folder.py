@@ -1,4 +1,4 @@
-"""Run folder: where the checkpoints of a run lie, which is the newest, and who may write them.
+"""Run folder: what a run says of itself, where its checkpoints lie, which is the newest, and who may write them.
 
 Apart from `graings.checkpoint` so that those who only ask how far a run got need no tensors. Knows nothing of what is
 in a checkpoint.
@@ -7,17 +7,48 @@ in a checkpoint.
 from __future__ import annotations
 
 import fcntl
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from graings.errors import CheckpointError
 
+RECORD_FILE = "run.json"
 LOCK_FILE = ".training"
 CHECKPOINTS = "checkpoints"
 MODEL_FILE = "model.graings"  # the model alone, small, as it is given away
 BEST = "best"
 FACTS_FILE = "checkpoint.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What a run says of itself: its options as they were stored, where its capture lay, and that capture's hash."""
+
+    config: Any
+    capture: Path
+    capture_hash: str
+
+
+def read_record(run: Path) -> Record:
+    """The record of a run folder. Raises `CheckpointError`."""
+    file = run / RECORD_FILE
+    try:
+        facts = json.loads(file.read_text())
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"{run}: holds no run to resume or measure, for there is no {RECORD_FILE}. Give the folder of a run, not of "
+            "one of its checkpoints."
+        ) from error
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{file}: not readable ({error}). Train anew.") from error
+    try:
+        return Record(facts["config"], Path(facts["capture"]["path"]), facts["capture"]["hash"])
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"{file}: is not what a run writes there ({error!r}). Train anew.") from error
 
 
 def checkpoints(run: Path) -> list[Path]:

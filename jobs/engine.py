@@ -59,7 +59,8 @@ class Engine:
                 system_database_url=url, application_name=APPLICATION, serializer=DBOSPortableJSONSerializer()
             )
         except Exception as error:  # whatever the database driver raises, it means one thing
-            raise JobError(f"The job database {_without_password(url)} cannot be opened: {error}") from error
+            why = (str(error).splitlines() or [repr(error)])[0]
+            raise JobError(f"The job database {_without_password(url)} cannot be opened: {why}") from error
 
     def enqueue(self, job_id: str, priority: int) -> None:
         """Put a job in the queue; one that is there already stays as it is."""

@@ -128,13 +128,8 @@ class Store:
             folder.mkdir(parents=True, exist_ok=True)
 
     def capture(self, digest: str) -> Path:
-        """Where the capture's files begin: below folders that hold nothing but one folder."""
-        folder = self._captures / digest
-        while True:
-            inside = list(folder.iterdir()) if folder.is_dir() else []
-            if len(inside) != 1 or not inside[0].is_dir():
-                return folder
-            folder = inside[0]
+        """Where the capture's files begin."""
+        return capture_root(self._captures / digest)
 
     def create(self, spec: JobSpec, unpacked: Path) -> str:
         """A new job whose capture lies in the folder `unpacked`, which is moved into the store. Returns its id."""
@@ -204,6 +199,15 @@ class Store:
         """One at a time adds or removes jobs and captures, whichever process it is in."""
         with locked(self.root / "store.lock"):
             yield
+
+
+def capture_root(folder: Path) -> Path:
+    """Where the files of an unpacked archive begin: below folders that hold nothing but one folder."""
+    while True:
+        inside = list(folder.iterdir()) if folder.is_dir() else []
+        if len(inside) != 1 or not inside[0].is_dir():
+            return folder
+        folder = inside[0]
 
 
 def _files(folder: Path) -> dict[str, int]:

@@ -13,7 +13,10 @@ import typer
 import uvicorn
 
 from graings.errors import ConfigError
+from jobs.engine import Engine
+from jobs.job import JobError
 from jobs.parent import watch_parent
+from jobs.store import Store
 from service.app import create_app
 from service.settings import Settings
 from service.worker_child import WorkerChild
@@ -40,6 +43,13 @@ def serve(
     except ConfigError as error:
         typer.echo(f"serve: {error}", err=True)
         raise typer.Exit(2) from error
+    try:
+        # Opened once before there is a server: within one, what is wrong would be said as a traceback.
+        Store(settings.data)
+        Engine(settings.database_url).close()
+    except (OSError, JobError) as error:
+        typer.echo(f"serve: {error}. Choose another --data or --database.", err=True)
+        raise typer.Exit(1) from error
     server = uvicorn.Server(
         uvicorn.Config(
             create_app(settings),

@@ -91,6 +91,12 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (GraingsError, 500, "graings"),
 )
 
+# What to say where a framework says no more than the status.
+_REMEDIES = {
+    404: "There is nothing at this address. /docs lists every address there is.",
+    405: "This address does not take that method; the header Allow names those it takes.",
+}
+
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {
         "description": "What is wrong with the request",
@@ -137,7 +143,7 @@ def install(app: FastAPI) -> None:
     async def http(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         phrase = HTTPStatus(error.status_code).phrase
-        detail = None if error.detail == phrase else str(error.detail)
+        detail = _REMEDIES.get(error.status_code) if error.detail == phrase else str(error.detail)
         return problem(request, error.status_code, detail, headers=dict(error.headers) if error.headers else None)
 
     async def validation(request: Request, error: Exception) -> Response:

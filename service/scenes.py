@@ -44,7 +44,7 @@ class Scenes:
         self._guard = threading.Lock()
 
     def load(self, run: Path) -> Model | None:
-        """The model in the newest checkpoint of a run folder, or None. Raises `CheckpointError`."""
+        """The model in the newest checkpoint of a run folder that can be read, or None. Raises `CheckpointError`."""
         # One at a time: two requests for the same new checkpoint should read it once.
         with self._guard:
             checkpoint = newest_checkpoint(run)
@@ -54,16 +54,15 @@ class Scenes:
             model = self._loaded.get(key) if key else None
             if model is None:
                 try:
-                    model = load_model(checkpoint)
+                    model = load_model(run)
                 except CheckpointError:
-                    newer = newest_checkpoint(run)
-                    if newer == checkpoint:
+                    if newest_checkpoint(run) == checkpoint:
                         raise
-                    # Training went on and removed this one while it was read.
-                    model = load_model(newer or run)
-                key = _key(model.path)
+                    model = load_model(run)  # training went on and removed this one while it was read
+                if newest_checkpoint(run) != checkpoint:
+                    key = _key(model.path)
                 if key:
-                    self._forget(model.path.parent)
+                    self._forget(checkpoint.parent)
                     self._loaded[key] = model
             if key:
                 self._loaded.move_to_end(key)

@@ -53,4 +53,4 @@ class Settings(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             problems = "; ".join(f"{PREFIX}{str(e['loc'][0]).upper()}: {e['msg']}" for e in error.errors())
-            raise ConfigError(f"{problems}. See the settings in the documentation.") from error
+            raise ConfigError(f"{problems}. docs/api.md lists every setting.") from error

@@ -67,7 +67,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.compact": ("graings.checkpoint", "graings.constants", "graings.errors", "graings.model", "graings.scene"),
     "graings.evaluation": (
         *("graings.capture", "graings.checkpoint", "graings.errors", "graings.metrics", "graings.render"),
-        *("graings.report", "graings.scene"),
+        *("graings.report", "graings.run_folder", "graings.scene"),
     ),
     "graings.training": (
         *("graings.training", "graings.capture", "graings.scene", "graings.raster", "graings.render"),
@@ -113,7 +113,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     # HTTP never trains.
     "service": (
-        *("service", "jobs", "graings", "graings.camera", "graings.checkpoint", "graings.config", "graings.encode"),
+        *("service", "jobs", "graings", "graings.camera", "graings.capture.load", "graings.checkpoint"),
+        *("graings.config", "graings.encode"),
         *("graings.errors", "graings.model", "graings.render", "graings.threads", "graings.units", "graings.viewpoint"),
     ),
     "service.demo": ("service", "jobs", "graings.capture.synthetic", "graings.errors"),

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from graings.ablation.plot import differences_svg
-from graings.ablation.rows import ROWS, Row, chosen_rows, combined, row_config
+from graings.ablation.rows import ROWS, Row, chosen_rows, combined, nothing_to_compare, row_config
 from graings.ablation.table import SCHEMA, document, markdown
 from graings.capture.capture import Capture
 from graings.capture.load import load_capture
@@ -51,6 +51,7 @@ class Ablation:
     `settings` are the user's options, dotted or nested, beside what a row demands. Raises `ConfigError` for options
     (also: for a `folder` that was begun with others), `CaptureError` for a capture without validation views and
     `CheckpointError` for a folder that holds something else. A folder may be asked for more rows and seeds later.
+    Without `rows` it is all that differ from the full model under these options; `notes` say which do not.
     """
 
     def __init__(
@@ -69,10 +70,15 @@ class Ablation:
         settings = dict(settings or {})
         self.folder = folder
         self.threads = threads
-        self.rows = chosen_rows(rows)
         self.seeds = tuple(dict.fromkeys(seeds))
         if threads is not None:
             settings["threads"] = threads
+        self.rows, self.notes = chosen_rows(rows), tuple[str, ...]()
+        if not rows:
+            # Who names no row wants those that say something.
+            same = {row.name: nothing_to_compare(row, preset, settings) for row in self.rows}
+            self.rows = tuple(row for row in self.rows if same[row.name] is None)
+            self.notes = tuple(f"{why} It is left out." for why in same.values() if why is not None)
         self.jobs = tuple(
             Job(row, seed, folder / _place(row, seed), row_config(row, preset, settings, seed))
             for seed in self.seeds

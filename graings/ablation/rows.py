@@ -138,6 +138,9 @@ def row_config(row: Row, preset: str, settings: Mapping[str, Any], seed: int) ->
 
     Raises `ConfigError` for settings that contradict the row, or that leave it no different from the full model.
     """
+    same = nothing_to_compare(row, preset, settings)
+    if same is not None:
+        raise ConfigError(f"{same} Give it more, or leave the row out (--rows).")
     asked = make_config(preset, dict(settings))
     if "seed" in asked.model_fields_set:
         raise ConfigError("seed: an ablation gives every row the same seeds. Leave it out and use --seeds.")
@@ -148,13 +151,16 @@ def row_config(row: Row, preset: str, settings: Mapping[str, Any], seed: int) ->
                 f"{key}: is set to {value!r}, but the row {row.name} is {wanted!r} there. "
                 "Leave the setting out, or name the rows that agree with it (--rows)."
             )
+    return combined(row, preset, settings, seed)
+
+
+def nothing_to_compare(row: Row, preset: str, settings: Mapping[str, Any]) -> str | None:
+    """Why the row would be the full model under these options; None where it differs."""
+    asked = make_config(preset, dict(settings))
     for key, number in row.needs.items():
         if _option(asked, key)[0] <= number:
-            raise ConfigError(
-                f"{key}: is {number}, so the row {row.name} would be the full model over again. "
-                "Give it more, or leave the row out (--rows)."
-            )
-    return combined(row, preset, settings, seed)
+            return f"{key}: is {number}, so the row {row.name} would be the full model over again."
+    return None
 
 
 def combined(row: Row, preset: str, settings: Mapping[str, Any], seed: int) -> TrainConfig:

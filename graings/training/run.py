@@ -7,7 +7,7 @@ Knows nothing of terminals, jobs or HTTP.
 
 from __future__ import annotations
 
-import json
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -22,6 +22,7 @@ from graings.checkpoint import (
     best_checkpoint,
     load_model,
     load_state,
+    load_training,
     newest_checkpoint,
     save_checkpoint,
 )
@@ -32,12 +33,14 @@ from graings.evaluation import evaluate, subset
 from graings.metrics import Lpips, SplitMetrics
 from graings.plan import Plan, make_plan
 from graings.report import read_metrics
-from graings.run_folder import MODEL_FILE, sole_trainer
+from graings.run_folder import MODEL_FILE, RECORD_FILE, read_record, sole_trainer
 from graings.threads import use_threads
 from graings.training.journal import EvaluationPoint, Journal
 from graings.training.pace import Clock, Rate, evaluation_marks
 from graings.training.stiffness import Stiffness, subpixel_share
 from graings.training.trainer import StepReport, Trainer
+
+LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,25 +93,25 @@ class TrainingRun:
         `capture` is where the capture lies now, if it moved. Raises `CheckpointError` when the folder holds no
         run or the capture is another one.
         """
-        try:
-            facts = json.loads((folder / "run.json").read_text())
-        except (OSError, ValueError) as error:
-            raise CheckpointError(f"{folder}: holds no run to resume ({error}). Start one without --resume.") from error
-        config = restored_training(facts.get("config"), folder / "run.json")
+        record = read_record(folder)
+        config = restored_training(record.config, folder / RECORD_FILE)
         clock = Clock()
         started = time.perf_counter()
-        data = load_capture(capture or Path(facts["capture"]["path"]), config.capture)
-        if data.content_hash != facts["capture"]["hash"]:
+        data = load_capture(capture or record.capture, config.capture)
+        if data.content_hash != record.capture_hash:
             raise CheckpointError(f"{data.root}: not the capture this run began with. Give the original one.")
         clock.add("load", time.perf_counter() - started)
         run = cls(folder, data, config, threads, clock)
         if newest_checkpoint(folder) is not None:
-            state = load_state(folder)
-            run._trainer.load(load_model(folder).scene, state.tensors, state.facts["trainer"])
-            run._journal.load(state.facts)
-        best = best_checkpoint(folder)
-        if best is not None:
-            run._best_psnr = load_state(best).facts["curve"][-1]["psnr"]
+            model, state = load_training(folder)
+            try:
+                run._trainer.load(model.scene, state.tensors, state.facts["trainer"])
+                run._journal.load(state.facts)
+            except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
+                raise CheckpointError(
+                    f"{model.path}: damaged training state ({error!r}). Remove it to go on from an earlier one."
+                ) from error
+        run._best_psnr = _psnr_of_best(folder)
         return run
 
     @property
@@ -286,7 +289,7 @@ class TrainingRun:
         if not self.metrics_path.exists():
             return False
         document = read_metrics(self.metrics_path)
-        return bool(document["iterations"] == self.iterations and (document["splits"] or not self.capture.val))
+        return bool(document.get("iterations") == self.iterations and (document.get("splits") or not self.capture.val))
 
     def _write_metrics(
         self, splits: dict[str, Any], compact: dict[str, Any] | None = None, stiffness: Stiffness | None = None
@@ -298,3 +301,15 @@ class TrainingRun:
     def _point(self, metrics: SplitMetrics) -> EvaluationPoint:
         stiffness = self._stiffness(subset(self.capture.train, self.config.evaluation.views))
         return self._journal.point(self.iteration, metrics, self._trainer.scene.scaffold.count, stiffness)
+
+
+def _psnr_of_best(folder: Path) -> float | None:
+    """Held-out PSNR of the best checkpoint so far; None where none can be read."""
+    best = best_checkpoint(folder)
+    if best is None:
+        return None
+    try:
+        return float(load_state(best).facts["curve"][-1]["psnr"])
+    except (CheckpointError, KeyError, IndexError, TypeError, ValueError) as error:
+        LOG.warning("%s: cannot be read (%s). The next evaluation takes its place.", best, error)
+        return None

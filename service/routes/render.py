@@ -15,8 +15,10 @@ from pydantic import BaseModel, ConfigDict, Field
 import graings
 from graings.camera import Camera, View
 from graings.encode import FORMATS, MEDIA_TYPES, ImageFormat
+from graings.errors import CheckpointError
 from graings.model import Model
 from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
+from jobs.job import JobNotFound
 from service.context import Context, Here
 from service.negotiation import preferred
 from service.problems import RESPONSES, BadRequest, NotAcceptable, NotYet
@@ -137,10 +139,19 @@ def _model(here: Context, job_id: str | None) -> tuple[str, Model]:
         if model is None:
             raise NotYet(f"Job {job_id} has no checkpoint yet. Try again when its resource has a render link.")
         return job_id, model
+    damaged: CheckpointError | None = None
     for candidate in here.store.ids():
-        model = here.scenes.load(here.store.folder(candidate).run)
+        try:
+            model = here.scenes.load(here.store.folder(candidate).run)
+        except JobNotFound:
+            continue  # deleted meanwhile
+        except CheckpointError as error:
+            damaged = damaged or error
+            continue
         if model is not None:
             return candidate, model
+    if damaged is not None:
+        raise damaged
     raise NotYet("There is no model yet. Submit a capture to /jobs.")
 
 

@@ -44,6 +44,14 @@ def folder(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return where
 
 
+def test_rows_that_nobody_named_are_left_out_where_they_say_nothing(capture: Path, tmp_path: Path) -> None:
+    whole = ablation(tmp_path, capture, preset="paper", settings={**SETTINGS, "batch": 1})
+    assert [row.name for row in whole.rows] == [name for name in NAMES if name != "no_rigidity"]
+    assert ["no_rigidity" in note and "left out" in note for note in whole.notes] == [True]
+    with pytest.raises(ConfigError, match="no_rigidity"):
+        ablation(tmp_path, capture, preset="paper", settings={**SETTINGS, "batch": 1}, rows=("no_rigidity",))
+
+
 def everything_in(folder: Path) -> dict[str, bytes]:
     runs = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in runs}

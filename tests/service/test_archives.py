@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import tarfile
 import zipfile
 from pathlib import Path
@@ -45,6 +46,30 @@ def refused(archive: Path, limits: Limits = LIMITS) -> str:
         unpack(archive, archive.parent / "out", limits)
     assert sorted(archive.parent.rglob("*")) == before
     return str(caught.value)
+
+
+@pytest.mark.parametrize("mode", ["zip", "w:gz"])
+def test_any_damaged_byte_is_refused_or_harmless(tmp_path: Path, mode: str) -> None:
+    """One error class of a library that nobody thought of would be a failure of the service."""
+    files = {"transforms_train.json": b'{"frames": []}', "train/r_0.png": bytes(range(256))}
+    if mode == "zip":
+        archive = zipped(tmp_path / "whole", files, compression=zipfile.ZIP_DEFLATED)
+    else:
+        archive = tarred(tmp_path / "whole", *((member(name), content) for name, content in files.items()), mode=mode)
+    content, refusals = archive.read_bytes(), 0
+    for place in range(len(content)):
+        for flip in (0x01, 0x80, 0xFF):
+            damaged = bytearray(content)
+            damaged[place] ^= flip
+            (tmp_path / "damaged").write_bytes(damaged)
+            try:
+                unpack(tmp_path / "damaged", tmp_path / "out", LIMITS)
+            except ArchiveError:
+                refusals += 1
+            else:
+                shutil.rmtree(tmp_path / "out")
+            assert not (tmp_path / "out").exists()
+    assert refusals > len(content)
 
 
 @pytest.mark.parametrize("mode", ["zip", "w", "w:gz"])

@@ -40,6 +40,19 @@ def test_an_interrupted_service_takes_its_worker_along(tmp_path: Path, number: s
             process.terminate()
 
 
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [(["--data", "/proc/nowhere"], "/proc/nowhere"), (["--database", "foo://bar"], "foo://bar")],
+)
+def test_a_service_that_cannot_open_its_data_says_so_in_one_line(tmp_path: Path, options: list[str], word: str) -> None:
+    command = [sys.executable, "-m", "service.commands", "--port", "0", "--data", str(tmp_path), *options]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
+    assert ended.returncode == 1
+    (line,) = ended.stderr.splitlines()
+    assert word in line
+    assert "--data" in line
+
+
 def readiness(port: int) -> dict[str, Any]:
     """What /readyz says; nothing while nobody listens."""
     time.sleep(0.1)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,8 @@ def test_a_form_with_a_file_and_options_does_the_same(client: TestClient, archiv
         ({"config": '{"iterations": 0}'}, "iterations"),
         ({"config": '{"itrations": 5}'}, "itrations"),
         ({"config": '{"loss": {"ssim": 1e999}}'}, "loss.ssim"),
+        ({"config": '{"a":' * 900 + "1" + "}" * 900}, "parts"),
+        ({"config": '{"' + "a." * 2_000 + 'a": 1}'}, "parts"),
         ({"priority": "0"}, "priority"),
         ({"name": ""}, "name"),
     ],
@@ -73,7 +76,7 @@ def test_wrong_options_are_refused_by_name(
 def test_wrong_options_in_a_form_are_refused_and_leave_nothing(
     client: TestClient, archive: bytes, settings: Settings
 ) -> None:
-    for form in ({"config": "{"}, {"config": '{"iterations": -1}'}):
+    for form in ({"config": "{"}, {"config": '{"iterations": -1}'}, {"config": "[" * 200_000}):
         problem(client.post("/jobs", files={"capture": archive}, data=form), 422)
     assert "capture" in problem(client.post("/jobs", files={"file": archive}), 422)["detail"]
     assert left_behind(settings) == []
@@ -89,6 +92,46 @@ def test_a_bad_archive_is_refused_and_leaves_nothing(client: TestClient, setting
     problem(client.post("/jobs", content=b"hello"), 422)
     problem(client.post("/jobs"), 422)
     assert left_behind(settings) == []
+
+
+def repacked(archive: bytes, change: Callable[[str, bytes], bytes | None]) -> bytes:
+    """The archive with each file as `change` makes it; None leaves it out."""
+    memory = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(archive)) as source, zipfile.ZipFile(memory, "w") as target:
+        for name in source.namelist():
+            if not name.endswith("/") and (content := change(name, source.read(name))) is not None:
+                target.writestr(name, content)
+    return memory.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda name, content: None if name.endswith("train/r_000.png") else content, "train/r_000"),
+        (
+            lambda name, content: content.replace(b"camera_angle_x", b"angle") if "json" in name else content,
+            "transforms",
+        ),
+        (lambda name, content: content if name.endswith("r_000.png") else None, "the archive"),
+    ],
+    ids=["an image is missing", "a camera is missing", "only images"],
+)
+def test_a_capture_that_training_could_not_begin_on_is_refused_at_once(
+    client: TestClient, archive: bytes, settings: Settings, change: Callable[[str, bytes], bytes | None], word: str
+) -> None:
+    document = problem(client.post("/jobs", content=repacked(archive, change)), 422)
+    assert document["type"] == "urn:graings:problem:bad-capture"
+    assert word in document["detail"]
+    assert str(settings.data) not in document["detail"]
+    assert left_behind(settings) == []
+
+
+def test_the_type_of_a_form_is_known_in_any_case(client: TestClient, archive: bytes) -> None:
+    request = client.build_request("POST", "/jobs", files={"capture": archive})
+    request.headers["content-type"] = request.headers["content-type"].replace(
+        "multipart/form-data", "Multipart/Form-Data"
+    )
+    assert client.send(request).status_code == 202
 
 
 def test_a_body_that_is_too_large_is_refused_whether_it_says_so_or_not(client: TestClient, settings: Settings) -> None:

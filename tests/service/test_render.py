@@ -19,6 +19,7 @@ from graings.viewpoint import orbit_view
 from jobs.store import JobFolder
 from service.problems import Busy
 from service.scenes import Picture, RenderPool, Scenes
+from service.settings import Settings
 from tests.service.conftest import ITERATIONS, SIZE
 from tests.service.test_jobs import problem
 
@@ -161,6 +162,7 @@ POSE = json.dumps(np.eye(4).tolist())
         ({"pose": "[[NaN", "fx": "9", "width": "9", "height": "9"}, "pose"),
         ({"pose": POSE.replace("1.0", "NaN"), "fx": "9", "width": "9", "height": "9"}, "finite"),
         ({"pose": POSE.replace("1.0", "2.0", 1), "fx": "9", "width": "9", "height": "9"}, "rigid"),
+        ({"pose": "[" * 3_900, "fx": "9", "width": "9", "height": "9"}, "pose"),
         ({"azimut": "30"}, "azimut"),
     ],
 )
@@ -191,6 +193,21 @@ def test_the_newest_job_that_has_a_model_is_shown(client: TestClient, model: str
     newer = client.post("/jobs", content=archive).json()["id"]
     assert newer > model
     assert client.get("/render").headers["x-graings-job"] == model
+
+
+def test_a_damaged_checkpoint_hides_neither_the_one_before_nor_other_jobs(
+    client: TestClient, model: str, folder: JobFolder, archive: bytes, trained: Path, settings: Settings
+) -> None:
+    newest = folder.run / "checkpoints" / f"{ITERATIONS:08d}"
+    later = newest.with_name(f"{ITERATIONS + 5:08d}")
+    shutil.copytree(newest, later)
+    (later / "scene.safetensors").write_bytes(b"torn")
+    answer = client.get("/render", params={"job": model})
+    assert (answer.status_code, answer.headers["X-Graings-Iteration"]) == (200, str(ITERATIONS))
+    other = client.post("/jobs", content=archive).json()["id"]
+    shutil.copytree(later, settings.data / "jobs" / other / "run" / "checkpoints" / later.name)
+    assert "damaged" in problem(client.get("/render", params={"job": other}), 500)["detail"]
+    assert client.get("/render").headers["X-Graings-Job"] == model
 
 
 def test_a_model_is_loaded_once_until_its_checkpoint_changes(trained: Path, tmp_path: Path) -> None:

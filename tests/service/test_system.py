@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 from starlette.testclient import TestClient
@@ -67,3 +68,10 @@ def test_settings_come_from_the_environment_and_what_is_given_wins() -> None:
 
 def test_the_service_listens_to_this_machine_only_unless_told() -> None:
     assert Settings().host == "127.0.0.1"
+
+
+def test_the_documentation_lists_every_setting_with_its_default() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "api.md").read_text()
+    for name, field in Settings.model_fields.items():
+        default = "" if field.default is None else f"`{field.default}`"
+        assert f"| `{name}` | {default} | {field.description} |" in text

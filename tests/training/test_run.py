@@ -12,11 +12,10 @@ import torch
 
 from graings.capture.synthetic import write_synthetic
 from graings.checkpoint import load_model, newest_checkpoint
-from graings.config import TrainConfig, make_config
+from graings.config import SHAPE_BEFORE, TrainConfig, make_config
 from graings.errors import CheckpointError
 from graings.evaluation import evaluate, evaluate_run
 from graings.metrics import SplitMetrics
-from graings.model import BEFORE
 from graings.training.run import TrainingRun
 
 ITERATIONS = 60
@@ -225,6 +224,70 @@ def test_a_damaged_checkpoint_is_named(capture: Path, tmp_path: Path) -> None:
         load_model(tmp_path / "run")
 
 
+@pytest.mark.parametrize("file", ["scene.safetensors", "state.safetensors", "checkpoint.json"])
+def test_a_damaged_newest_checkpoint_costs_the_steps_since_the_one_before(
+    capture: Path, tmp_path: Path, file: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "run"
+    expected = tmp_path / "unbroken"
+    list(TrainingRun.create(capture, expected, _config()))
+    list(TrainingRun.create(capture, folder, _config()))
+    older, newest = sorted(one for one in (folder / "checkpoints").iterdir() if one.name.isdigit())
+    (newest / file).write_bytes((newest / file).read_bytes()[:100])
+    resumed = TrainingRun.resume(folder, threads=1)
+    assert resumed.iteration == int(older.name)
+    assert str(newest / file if file == "checkpoint.json" else newest) in caplog.text
+    assert "damaged" in caplog.text or "not readable" in caplog.text
+    assert file == "state.safetensors" or load_model(folder).iteration == int(older.name)
+    list(resumed)  # what is written at the end takes the place of the damaged one
+    for name, tensor in _tensors(expected).items():
+        assert torch.equal(tensor, _tensors(folder)[name]), name
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"not a tensor file"])
+def test_a_damaged_best_checkpoint_stops_nobody(
+    capture: Path, tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config())
+    for report in run:
+        if report.iteration == 40:
+            break
+    run.save()
+    (tmp_path / "run" / "checkpoints" / "best" / "checkpoint.json").write_bytes(content)
+    resumed = TrainingRun.resume(tmp_path / "run", threads=1)
+    assert "best" in caplog.text
+    list(resumed)
+    assert load_model(tmp_path / "run" / "checkpoints" / "best").iteration > 40
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"config": {}}', '{"config": {}, "capture": []}', "{"])
+def test_a_damaged_record_is_named_by_all_who_read_it(capture: Path, tmp_path: Path, content: str) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config())
+    next(iter(run))
+    run.save()
+    (tmp_path / "run" / "run.json").write_text(content)
+    with pytest.raises(CheckpointError, match=r"run\.json.*(anew|again)"):
+        TrainingRun.resume(tmp_path / "run")
+    with pytest.raises(CheckpointError, match=r"run\.json.*(anew|again)"):
+        evaluate_run(tmp_path / "run", "val")
+
+
+def test_a_training_state_that_lacks_something_is_named(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config())
+    next(iter(run))
+    file = run.save() / "checkpoint.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"state": {}}))
+    with pytest.raises(CheckpointError, match=rf"{file.parent.name}.*KeyError.*Remove it"):
+        TrainingRun.resume(tmp_path / "run")
+
+
+def test_metrics_without_splits_are_named(capture: Path, tmp_path: Path) -> None:
+    list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=2)))
+    (tmp_path / "run" / "metrics.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"metrics\.json.*splits.*--resume"):
+        evaluate_run(tmp_path / "run", "val")
+
+
 def test_test_split_is_measured_only_when_asked(capture: Path, tmp_path: Path) -> None:
     list(TrainingRun.create(capture, tmp_path / "run", _config()))
     metrics = evaluate_run(tmp_path / "run", "test")
@@ -289,7 +352,7 @@ def test_options_of_another_version_are_named_and_not_taken_for_damage(capture: 
             read(tmp_path / "run")
 
 
-@pytest.mark.parametrize(("name", "before"), BEFORE.items())
+@pytest.mark.parametrize(("name", "before"), SHAPE_BEFORE.items())
 def test_a_model_from_before_a_choice_is_still_read(capture: Path, tmp_path: Path, name: str, before: object) -> None:
     list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=12, **{f"scene.{name}": before})))
     expected = load_model(tmp_path / "run").scene.gaussians((0.0, -3.0, 0.0), 0.7)
@@ -297,6 +360,8 @@ def test_a_model_from_before_a_choice_is_still_read(capture: Path, tmp_path: Pat
         facts = json.loads(path.read_text())
         del facts["scene_config"][name], facts["config"]["scene"][name]
         path.write_text(json.dumps(facts))
-    found = load_model(tmp_path / "run").scene.gaussians((0.0, -3.0, 0.0), 0.7)
+    model = load_model(tmp_path / "run")
+    assert getattr(model.config.scene, name) == before
+    found = model.scene.gaussians((0.0, -3.0, 0.0), 0.7)
     assert torch.equal(found.means, expected.means)
     assert torch.equal(found.colors, expected.colors)

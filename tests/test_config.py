@@ -1,0 +1,49 @@
+"""Options: what is refused, and that it is refused by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from graings.config import DEEPEST, make_config
+from graings.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("capture.background", (5.0, 0.0, 0.0)),
+        ("capture.background", (0.0, -1.0, 0.0)),
+        ("capture.background", (1e300, 0.0, 0.0)),
+        ("rates.offsets", (-1.0, 1.0)),
+        ("rates.matrices", (1e-3, -1e-5)),
+        ("init.voxel_size", 1e-30),
+        ("loss.rigidity", -0.1),
+        ("iterations", 0),
+        ("loss.ssim", float("nan")),
+    ],
+)
+def test_a_value_outside_its_bounds_is_refused_by_name(key: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=key.replace(".", r"\.")):
+        make_config("draft", {key: value})
+
+
+def nested(depth: int) -> dict[str, Any]:
+    value: dict[str, Any] = {"a": 1}
+    for _ in range(depth):
+        value = {"a": value}
+    return value
+
+
+@pytest.mark.parametrize("settings", [{"a." * 3_000 + "a": 1}, nested(900)])
+def test_settings_deeper_than_any_option_are_refused_before_python_gives_up(settings: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="graings options"):
+        make_config("draft", settings)
+
+
+def test_every_option_is_less_deep_than_that() -> None:
+    def depth(value: Any) -> int:
+        return 1 + max(map(depth, value.values()), default=0) if isinstance(value, dict) else 0
+
+    assert depth(make_config().model_dump()) < DEEPEST
