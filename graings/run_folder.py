@@ -40,8 +40,8 @@ def read_record(run: Path) -> Record:
         facts = json.loads(file.read_text())
     except FileNotFoundError as error:
         raise CheckpointError(
-            f"{run}: holds no run to resume or measure, for there is no {RECORD_FILE}. Give the folder of a run, not of "
-            "one of its checkpoints."
+            f"{run}: holds no run to resume or measure, for there is no {RECORD_FILE}. Give the folder of a run, not "
+            "that of one of its checkpoints."
         ) from error
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{file}: not readable ({error}). Train anew.") from error

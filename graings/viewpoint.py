@@ -16,6 +16,9 @@ from numpy.typing import ArrayLike
 from graings.camera import Camera, Vector, View
 from graings.units import Units
 
+# Orbits stay between these distances, in normalised units: beyond them a camera's place is lost to rounding.
+NEAREST, FARTHEST = 1e-9, 1e9
+
 
 def orbit_view(
     model_views: Sequence[View],
@@ -38,6 +41,8 @@ def orbit_view(
     if not model_views:
         raise ValueError("an orbit takes its defaults from the training views, and there are none")
     aim = _point("target", units.center if target is None else target)
+    if any(abs(x - c) > FARTHEST / units.scale for x, c in zip(aim, units.center, strict=True)):
+        raise ValueError(f"target must lie within {FARTHEST / units.scale:g} of the scene's centre, got {list(aim)}")
     aim_normalised = units.points(aim)
     up = np.asarray(units.up, dtype=np.float64)
     arms = np.stack([view.camera.center for view in model_views]) - aim_normalised
@@ -56,8 +61,9 @@ def orbit_view(
             raise ValueError(f"{name} must be finite, got {value}")
     if not -90.0 <= elevation <= 90.0:
         raise ValueError(f"elevation must lie in [-90, 90] degrees, got {elevation:g}")
-    if radius <= 0.0:
-        raise ValueError(f"radius must be positive, got {radius:g}")
+    if not NEAREST / units.scale <= radius <= FARTHEST / units.scale:
+        least, most = NEAREST / units.scale, FARTHEST / units.scale
+        raise ValueError(f"radius must lie between {least:g} and {most:g}, got {radius:g}")
     if not 0.0 < fov < 180.0:
         raise ValueError(f"fov must lie in (0, 180) degrees, got {fov:g}")
     width_, height_ = _size(first, width, height)
