@@ -21,6 +21,9 @@ from graings.units import Units
 
 Array = NDArray[np.float64]
 
+# Focal lengths and distances of the principal point beyond these, in picture sizes, are slips of the file.
+SHORTEST, LONGEST, OFF_AXIS = 1e-3, 1e6, 1e3
+
 # Time stamps closer than this share of the whole range are one instant.
 SAME_INSTANT = 1e-6
 
@@ -44,6 +47,7 @@ def normalize(recording: Recording, *, root: Path, max_side: int | None, content
                     field=field,
                     remedy="Correct it in the file that lists the image.",
                 )
+        _check_lens(shot)
     cameras = [shot.camera for shot in recording.splits["train"]]
     center, scale, found = frame_of_reference(cameras, recording.positions)
     notes += found
@@ -97,6 +101,26 @@ def normalize(recording: Recording, *, root: Path, max_side: int | None, content
         notes=tuple(notes),
         content_hash=content_hash,
     )
+
+
+def _check_lens(shot: Shot) -> None:
+    """Raises `CaptureError` for a camera whose picture no rounding would survive."""
+    camera = shot.camera
+    for across, focal, middle, size in (
+        ("x", camera.fx, camera.cx, camera.width),
+        ("y", camera.fy, camera.cy, camera.height),
+    ):
+        if not SHORTEST <= focal / size <= LONGEST:
+            problem = f"is {focal / size:.3g} picture sizes; from {SHORTEST:g} to {LONGEST:g} are taken"
+            field = f"focal length f{across}"
+        elif abs(middle) / size > OFF_AXIS:
+            problem = f"is {middle / size:.3g} picture sizes; nothing beyond {OFF_AXIS:g} is taken"
+            field = f"principal point c{across}"
+        else:
+            continue
+        raise CaptureError(
+            problem, file=shot.image.name, field=field, remedy="Correct it in the file that holds the camera."
+        )
 
 
 def frame_of_reference(cameras: Sequence[Camera], points: Array | None) -> tuple[Array, float, list[str]]:
