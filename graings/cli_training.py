@@ -88,7 +88,9 @@ def ablate(
     ] = None,
     rows: Annotated[
         list[str] | None,
-        typer.Option(metavar="ROW ...", help=f"Some of {', '.join(row.name for row in ROWS)}; left out: all."),
+        typer.Option(
+            metavar="ROW ...", help=f"Some of {', '.join(row.name for row in ROWS)}; left out: all that differ."
+        ),
     ] = None,
     threads: Threads = None,
 ) -> None:

@@ -56,7 +56,8 @@ def rigidity(lengths: Float[Tensor, "instant pair"], weights: Float[Tensor, " pa
 
 def mean_square(rows: Float[Tensor, "row _"]) -> Tensor:
     """Mean over at least one row of its squared length."""
-    return torch.as_tensor(_SquaredLength.apply(rows)) / len(rows)  # type: ignore[no-untyped-call]
+    total: Tensor = _SquaredLength.apply(rows)  # type: ignore[no-untyped-call]
+    return total / len(rows)
 
 
 class _SquaredLength(torch.autograd.Function):
