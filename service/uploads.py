@@ -20,10 +20,6 @@ from anyio import open_file, to_thread
 from starlette.datastructures import FormData, UploadFile
 from starlette.requests import Request
 
-from graings.capture.load import load_capture
-from graings.config import CaptureConfig
-from graings.errors import CaptureError
-from jobs.store import capture_root
 from service.archives import Limits, unpack
 from service.problems import BadRequest
 
@@ -60,21 +56,6 @@ async def receive_capture(request: Request, uploads: Path, limits: Limits) -> As
     finally:
         archive.unlink(missing_ok=True)
         await to_thread.run_sync(lambda: shutil.rmtree(folder, ignore_errors=True))
-
-
-def check_capture(folder: Path, config: CaptureConfig) -> None:
-    """Raises `CaptureError` where training could not begin on the unpacked capture; files by their place in it."""
-    root = capture_root(folder)
-    try:
-        load_capture(root, config)
-    except CaptureError as error:
-
-        def as_sent(text: str) -> str:
-            return text.replace(f"{root}/", "").replace(str(root), "the archive")
-
-        raise CaptureError(
-            as_sent(error.problem), file=as_sent(error.file), field=error.field, remedy=as_sent(error.remedy)
-        ) from error
 
 
 def parse_config(text: str, where: str) -> dict[str, Any]:

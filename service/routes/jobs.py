@@ -11,9 +11,10 @@ from fastapi import APIRouter, Query, Request, Response
 from graings.config import PRESETS, make_config
 from jobs.job import ID_PATTERN, JobSpec
 from service.context import Here, JobId
+from service.inspection import inspect_capture
 from service.problems import RESPONSES
 from service.schemas import JobPage, JobResource, job_resource
-from service.uploads import check_capture, parse_config, receive_capture
+from service.uploads import parse_config, receive_capture
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], responses=RESPONSES)
 
@@ -61,7 +62,7 @@ async def submit(
     make_config(preset, overrides)
     async with receive_capture(request, here.store.uploads, here.limits) as upload:
         chosen = make_config(preset, {**overrides, **upload.config})
-        await to_thread.run_sync(check_capture, upload.folder, chosen.capture)
+        await inspect_capture(upload.folder, chosen.capture)
         spec = JobSpec(name=name, capture=upload.digest, config=chosen.model_dump(mode="json"), priority=priority)
         job = await to_thread.run_sync(here.jobs.submit, spec, upload.folder)
     response.headers["Location"] = f"/jobs/{job.id}"
