@@ -92,10 +92,10 @@ GRAINGS_INLINE void store_columns(R* rows, int64_t begin, int64_t end, const D* 
 #if defined(__AVX512F__)
 // Eight records from their columns: numbers of float64, and pairs of single precision that fill as much.
 GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*pairs)[2]) {
-    __m512d column[8];
+    __m512d column[8] = {};  // the last one is not used
     for (int c = 0; c < 3; c++) column[c] = (__m512d)whole[c].v;
     const __m512i alternate = _mm512_setr_epi32(0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15);
-    for (int c = 3; c < 8; c++) {
+    for (int c = 3; c < 7; c++) {
         const __m256 low = _mm512_cvtpd_ps((__m512d)pairs[c - 3][0].v), high = _mm512_cvtpd_ps((__m512d)pairs[c - 3][1].v);
         column[c] = _mm512_castps_pd(_mm512_permutexvar_ps(alternate, _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1)));
     }
@@ -121,11 +121,11 @@ GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, 
         }
 #endif
     double x[3][kGroup];
-    R y[10][kGroup];
+    R y[8][kGroup];
     for (int c = 0; c < 3; c++) store(x[c], whole[c]);
-    for (int c = 0; c < 10; c++) store_as<R>(y[c], pairs[c / 2][c % 2]);
+    for (int c = 0; c < 8; c++) store_as<R>(y[c], pairs[c / 2][c % 2]);
     for (int i = 0; i < kGroup && begin + i < end; i++)
-        records[begin + i] = {x[0][i], x[1][i], x[2][i], {y[0][i], y[1][i], y[2][i], y[3][i], y[4][i], y[5][i], y[6][i], y[7][i], y[8][i], y[9][i]}};
+        records[begin + i] = {x[0][i], x[1][i], x[2][i], {y[0][i], y[1][i], y[2][i], y[3][i], y[4][i], y[5][i], y[6][i], y[7][i]}};
 }
 
 }  // namespace graings::GRAINGS_ISA

@@ -116,7 +116,6 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         // by more than any rounding of the exponent.
         const D level = s.alpha_min > 0 ? log2(opacity * d8(1 / s.alpha_min)) : d8(1e30), root = sqrt(max(level, zero));
         const D widened = min(fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30));
-        const D flat = radius * tall, fall = d8(2 * kLn2) * p.c * p.v / p.a;
         const D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
         // blocks with a pixel's centre in it
         const auto block = [](D pixel) { return floor(pixel * d8(1.0 / kBlock)); };
@@ -156,7 +155,7 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         radii[0] = select(drawn, radii[0], zero), radii[1] = select(drawn, radii[1], zero);
         store_columns<2>(args.means2d, group, end, center), store_columns<2>(args.radii, group, end, radii);
         store_columns<1>(args.depths, group, end, &p.z);
-        const D whole[3] = {p.x, p.y, p.slope}, pairs[5][2] = {{sr, sy}, {opacity, color[0]}, {color[1], color[2]}, {p.z, widened}, {flat, fall}};
+        const D whole[3] = {p.x, p.y, p.slope}, pairs[4][2] = {{sr, sy}, {opacity, color[0]}, {color[1], color[2]}, {p.z, widened}};
         put_records(args.records, group, end, whole, pairs);
         for (int lane = 0; lane < kGroup && group + lane < end; lane++) {
             const auto is = [&](uint32_t which) { return which >> lane & 1; };

@@ -56,8 +56,20 @@ GRAINGS_INLINE Native<double> most(Native<double> a, Native<double> b) { return 
 GRAINGS_INLINE Native<double> root(Native<double> a) { return (Native<double>)_mm512_sqrt_pd((__m512d)a); }
 GRAINGS_INLINE float total(Native<float> a) { return _mm512_reduce_add_ps((__m512)a); }
 GRAINGS_INLINE double total(Native<double> a) { return _mm512_reduce_add_pd((__m512d)a); }
+GRAINGS_INLINE Native<float> joined(Native<double> lo, Native<double> hi) {
+    return (Native<float>)_mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps((__m512d)lo)), _mm512_cvtpd_ps((__m512d)hi), 1);
+}
 #else
 template <class T> using NativeMask = NativeBits<T>;
+GRAINGS_INLINE Native<float> joined(Native<double> lo, Native<double> hi) {
+#if defined(__AVX2__)
+    return (Native<float>)_mm256_set_m128(_mm256_cvtpd_ps((__m256d)hi), _mm256_cvtpd_ps((__m256d)lo));
+#else
+    Native<float> both;
+    for (int i = 0; i < 2; i++) both[i] = float(lo[i]), both[i + 2] = float(hi[i]);
+    return both;
+#endif
+}
 template <class V> GRAINGS_INLINE auto less(V a, V b) { return a < b; }
 template <class V> GRAINGS_INLINE auto less_equal(V a, V b) { return a <= b; }
 template <class M, class V> GRAINGS_INLINE V choose(M m, V a, V b) { return m ? a : b; }
@@ -204,6 +216,12 @@ template <class R, int N> GRAINGS_INLINE void store_as(R* p, Vec<double, N> a) {
         const Half rounded = __builtin_convertvector(a.v, Half);
         std::memcpy(p, &rounded, sizeof rounded);
     } else { store_as<R>(p, a.lo); store_as<R>(p + N / 2, a.hi); }
+}
+// Rounded to R.
+template <class R, int N> GRAINGS_INLINE Vec<R, N> rounded(Vec<double, N> a) {
+    if constexpr (sizeof(R) == sizeof(double)) return a;
+    else if constexpr (kOne<R, N>) return {joined(a.lo.v, a.hi.v)};
+    else return {rounded<R>(a.lo), rounded<R>(a.hi)};
 }
 // N numbers of R, widened.
 template <int N, class R> GRAINGS_INLINE Vec<double, N> load_as(const R* p) {

@@ -113,9 +113,9 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     struct Totals {
         P<R> e, er, es, err, ers, ess, red, green, blue, depth;
     };
-    const auto add = [&](Totals& total, const TileEntry<R>& entry, int j, const Seen& seen) {
+    const auto add = [&](Totals& total, const TileEntry<R>& entry, const Seen& seen) {
         const int b = seen.block;
-        const auto counts = (p16(limits.alpha_min) <= seen.raw) & (p16(R(j)) <= load<kLanes>(last[b]));
+        const auto counts = (p16(limits.alpha_min) <= seen.raw) & (p16(entry.number) <= load<kLanes>(last[b]));
         const P<R> alpha = select(counts, min(seen.raw, p16(limits.alpha_max)), zero);
         const P<R> before = load<kLanes>(light[b]) / (p16(R(1)) - alpha), weight = alpha * before;
         store(light[b], before);
@@ -154,13 +154,13 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     [[maybe_unused]] Seen seen;
     int open = -1;  // entry of the block looked at last
     const auto close = [&] {
-        add(total, entry_of(open), open, seen);
+        add(total, entry_of(open), seen);
         put(total, open);
     };
     for (int j = n - 1; j >= 0; j--) {
         if (j == n - 1 || j % kAhead == kAhead - 1)
             for (int i = j / kAhead * kAhead; i <= j; i++)
-                if (entries[i].mask & heard) prepare(entry_of(i), record_of(i), double(box.left), double(box.top));
+                if (entries[i].mask & heard) prepare(entry_of(i), record_of(i), double(box.left), double(box.top), i);
         if (j >= kAhead) __builtin_prefetch(&record_of(j - kAhead)), __builtin_prefetch(sums_of(j - kAhead), 1);
         uint32_t mask = entries[j].mask & heard;
         all.written[entries[j].place] = mask != 0;
@@ -172,12 +172,12 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
             open = j, seen = next, total = nothing;
             while (mask &= mask - 1) {
                 next = look(entry, mask);
-                add(total, entry, j, seen);
+                add(total, entry, seen);
                 seen = next;
             }
         } else {
             total = nothing;
-            for (; mask; mask &= mask - 1) add(total, entry, j, look(entry, mask));
+            for (; mask; mask &= mask - 1) add(total, entry, look(entry, mask));
             put(total, j);
         }
     }

@@ -21,41 +21,27 @@ template <class R>
 alignas(64) constexpr R kRows[kLanes] = {-1.5, -1.5, -1.5, -1.5, -0.5, -0.5, -0.5, -0.5, 0.5, 0.5, 0.5, 0.5, 1.5, 1.5, 1.5, 1.5};
 
 template <class R>
-GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top) {
+GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top, int64_t number) {
     const double sr = double(record.look.sr), sy = double(record.look.sy), dy = top + 2 - record.y, tilt = sr * record.slope;
-    entry.r = sr * ((left + 2 - record.x) - record.slope * dy), entry.s = sy * dy;
-    entry.sr = sr, entry.sy = sy, entry.tilt = tilt;
+    const auto all = [](double x) { return splat<double, kBlocks>(x); };
+    const Vec<double, kBlocks> x = load<kBlocks>(kBlockX<double>), y = load<kBlocks>(kBlockY<double>);
+    store(entry.r, rounded<R>(fma(all(sr), x, fma(all(-tilt), y, all(sr * ((left + 2 - record.x) - record.slope * dy))))));
+    store(entry.s, rounded<R>(fma(all(sy), y, all(sy * dy))));
     store(entry.lanes, fma(p16(record.look.sr), load<kLanes>(kColumns<R>), p16(R(-tilt)) * load<kLanes>(kRows<R>)));
-    entry.look = record.look, entry.lean = R(tilt);
+    entry.look = record.look, entry.lean = R(tilt), entry.number = R(number);
 }
-template <class R>
-GRAINGS_INLINE R r_at(const TileEntry<R>& entry, int block) {
-    return R(fused(entry.sr, kBlockX<double>[block], fused(-entry.tilt, kBlockY<double>[block], entry.r)));
-}
-template <class R>
-GRAINGS_INLINE R s_at(const TileEntry<R>& entry, int block) { return R(fused(entry.sy, kBlockY<double>[block], entry.s)); }
 
-// Blocks that a prepared entry reaches, one bit each: those where the least exponent over the rectangle of pixel
-// centres is at most the record's level. With u = |r| less half the width of the block, or 0, the exponent
-// u^2 + s^2 is convex in dy and smooth. Where s is least, either u is 0 and nothing is lower, or the lowest point
-// lies on the side of r's sign, where u is linear, or at an end. `edge` holds more than all rounding that grows with
-// the tile's size in r, here and in the pixels; what grows with r and s themselves, which are small wherever it
-// matters, is in the record's level.
+// Blocks that a prepared entry may reach, one bit each. Over a block's pixel centres r changes by 1.5 (sr + |tilt|) at
+// most and s by 1.5 sy: where the squares of what then remains of |r| and |s| exceed the record's level, nothing is drawn.
+// `margin` holds more than all rounding that grows with the tile's size in r and s, here and in the pixels; what grows
+// with r and s themselves, which are small wherever it matters, is in the record's level.
 template <class R>
 GRAINGS_INLINE uint32_t reached_blocks(const TileEntry<R>& entry) {
-    constexpr R unit = sizeof(R) == 4 ? R(6e-5) : R(1e-13);
-    const P<R> wide = p16(entry.look.sr), rise = p16(entry.look.sy), lean = p16(entry.lean), back = p16(R(0)) - lean;
-    const P<R> x = load<kLanes>(kBlockX<R>), y = load<kLanes>(kBlockY<R>);
-    const P<R> r = fma(wide, x, fma(back, y, p16(R(entry.r)))), s = fma(rise, y, p16(R(entry.s)));
-    const P<R> zero = p16(R(0)), high = p16(R(1.5)), low = p16(R(-1.5)), half = high * wide, edge = fma(p16(unit), wide + abs(lean), half);
-    const auto least = [&](P<R> t, P<R> dy) {
-        const P<R> u = max(abs(t) - edge, zero), v = fma(rise, dy, s);
-        return fma(u, u, v * v);
-    };
-    const P<R> flat = clamp(zero - p16(entry.look.flat) * s, low, high), t = fma(back, flat, r);
-    const P<R> side = select(t < zero, zero - half, half), fall = p16(entry.look.fall);
-    const P<R> lowest = clamp(fma(lean, r - side, zero - rise * s) * fall, low, high);
-    return bits(min(least(t, flat), least(fma(back, lowest, r), lowest)) <= p16(entry.look.level));
+    constexpr R margin = R(1.5) + (sizeof(R) == 4 ? R(6e-5) : R(1e-13));
+    const P<R> wide = p16(entry.look.sr), rise = p16(entry.look.sy), lean = abs(p16(entry.lean)), zero = p16(R(0));
+    const P<R> r = max(abs(load<kLanes>(entry.r)) - p16(margin) * (wide + lean), zero);
+    const P<R> s = max(abs(load<kLanes>(entry.s)) - p16(margin) * rise, zero);
+    return bits(fma(r, r, s * s) <= p16(entry.look.level));
 }
 
 // entries[b]: which of the masks have bit b.
@@ -73,14 +59,11 @@ GRAINGS_INLINE void by_block(const uint16_t (&masks)[kChunk], uint64_t (&entries
 #endif
 }
 
-// To look at so few blocks takes less than to find those of them that are not reached.
-constexpr int kFewBlocks = 2;
-
 template <class R> struct Distance { P<R> r, s; };
 
 template <class R>
 GRAINGS_INLINE Distance<R> distance(const TileEntry<R>& entry, int block, P<R> rows) {
-    return {load<kLanes>(entry.lanes) + p16(r_at(entry, block)), fma(p16(entry.look.sy), rows, p16(s_at(entry, block)))};
+    return {load<kLanes>(entry.lanes) + p16(entry.r[block]), fma(p16(entry.look.sy), rows, p16(entry.s[block]))};
 }
 
 template <class R>
@@ -190,14 +173,13 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
             Pair& pair = args.pairs[k + j];
             if (k + j + kChunk < pairs) __builtin_prefetch(&args.records[args.pairs[k + j + kChunk].id]);  // maybe the next tile's
             if (pair.mask &= live) {
-                prepare(chunk[j], args.records[pair.id], double(box.left), double(box.top));
-                if (!Compat && __builtin_popcount(pair.mask) > kFewBlocks) pair.mask &= reached_blocks(chunk[j]);
+                prepare(chunk[j], args.records[pair.id], double(box.left), double(box.top), k + j - start);
+                if constexpr (!Compat) pair.mask &= reached_blocks(chunk[j]);
             }
             masks[j] = uint16_t(pair.mask);
             items += __builtin_popcount(pair.mask);
         }
         by_block(masks, lists);
-        [[maybe_unused]] const R first = R(k - start);  // number in the tile
         for (int b = 0; b < kBlocks; b++) {
             if (lists[b] == 0) continue;
             P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]);
@@ -219,7 +201,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
                 const auto [weight, counts] = blend<R, Compat>(raw, limits, t, going);
                 if (!any(counts)) break;
                 raw = next;
-                if constexpr (Keep) latest = select(counts, p16(first + R(j)), latest);
+                if constexpr (Keep) latest = select(counts, p16(entry.number), latest);
                 red = fma(weight, p16(entry.look.red), red);
                 green = fma(weight, p16(entry.look.green), green);
                 blue = fma(weight, p16(entry.look.blue), blue);

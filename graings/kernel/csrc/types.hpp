@@ -30,10 +30,9 @@ enum Status : uint8_t { kDrawn, kNonFinite, kZeroQuat, kBehind, kFaint, kOutside
 
 // One projected Gaussian: a cache line in single precision. With dx, dy = pixel - mean,
 // alpha = opacity * 2^-((sr (dx - slope dy))^2 + (sy dy)^2); nothing is drawn where the exponent exceeds `level`.
-// `flat` = 1 / sy and `fall` = 1 / ((sr slope)^2 + sy^2) only tell where that exponent is least.
 template <class R>
 struct Look {
-    R sr, sy, opacity, red, green, blue, depth, level, flat, fall;
+    R sr, sy, opacity, red, green, blue, depth, level;
 };
 template <class R>
 struct alignas(64) Record {
@@ -64,15 +63,14 @@ struct Pair {
     uint32_t mask;   // blocks of the tile that it may touch, one bit each
 };
 
-// A record seen from one tile: with a pixel's place in its block, the scaled distances are r = r_at(block) +
-// lanes[pixel] and s = s_at(block) + sy * row. What a block adds is found in float64, where large numbers may cancel,
-// from r and s at the centre of the first block.
+// A record seen from one tile. The scaled distances of a block's pixel are r = r[block] + lanes[pixel] and
+// s = s[block] + sy * row. Those of the blocks' centres are found in float64, where large numbers may cancel.
 template <class R>
 struct alignas(64) TileEntry {
-    R lanes[kLanes];
-    double r, s, sr, sy, tilt;  // tilt: sr slope
+    R lanes[kLanes], r[kBlocks], s[kBlocks];
     Look<R> look;
-    R lean;  // the tilt, rounded
+    R lean;    // sr slope
+    R number;  // of the entry in its tile
 };
 
 template <class R>
