@@ -18,7 +18,7 @@ Mutants (j) to (m) break the way back through a tile; (n) to (p) and the five th
 blocks a Gaussian is looked at, and in which order.
 
 Tests that fail before anything is changed cannot notice a change: they are named and left out.
-Needs a compiler and CMake; takes a few minutes per mutant. Set GRAINGS_ISA to choose the instruction set that tests run
+Needs a compiler, CMake and `pip install nanobind`; takes a few minutes per mutant. Set GRAINGS_ISA to choose the instruction set that tests run
 with where they do not choose themselves.
 """
 
@@ -154,7 +154,7 @@ MUTANTS = (
         "k",
         "gradient counts entries behind the stop",
         TILE_GRADIENT,
-        "(p16(limits.alpha_min) <= seen.raw) & (p16(R(j)) <= load<kLanes>(last[b]))",
+        "(p16(limits.alpha_min) <= seen.raw) & (p16(entry.number) <= load<kLanes>(last[b]))",
         "p16(limits.alpha_min) <= seen.raw",
     ),
     Mutant(
@@ -176,10 +176,10 @@ MUTANTS = (
     ),
     Mutant(
         "o",
-        "blocks judged by the point of least s alone",
+        "blocks judged as if there were no tilt",
         TILES,
-        "min(least(t, flat), least(fma(back, lowest, r), lowest)) <=",
-        "least(t, flat) <=",
+        "p16(margin) * (wide + lean)",
+        "p16(margin) * wide",
     ),
     Mutant(
         "p",
@@ -196,18 +196,18 @@ MUTANTS = (
         "std::tuple(uids_[a.id], a.id) < std::tuple(uids_[b.id], b.id)",
     ),
     Mutant(
-        "low-missing",
-        "blocks judged by the lowest point beside it alone",
+        "rows-short",
+        "blocks judged as if they were a pixel less high",
         TILES,
-        "min(least(t, flat), least(fma(back, lowest, r), lowest)) <=",
-        "least(fma(back, lowest, r), lowest) <=",
+        "p16(margin) * rise",
+        "rise",
     ),
     Mutant(
         "no-slack",
         "blocks judged without slack for rounding",
         TILES,
-        "edge = fma(p16(unit), wide + abs(lean), half)",
-        "edge = half",
+        "constexpr R margin = R(1.5) + (sizeof(R) == 4 ? R(6e-5) : R(1e-13));",
+        "constexpr R margin = R(1.5);",
     ),
     Mutant(
         "row-narrow",
