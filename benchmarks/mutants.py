@@ -18,8 +18,8 @@ Mutants (j) to (m) break the way back through a tile; (n) to (p) and the five th
 blocks a Gaussian is looked at, and in which order.
 
 Tests that fail before anything is changed cannot notice a change: they are named and left out.
-Needs a compiler, CMake and `pip install nanobind`; takes a few minutes per mutant. Set GRAINGS_ISA to choose the instruction set that tests run
-with where they do not choose themselves.
+Needs a compiler, CMake and nanobind (pip install nanobind); takes a few minutes per mutant. Set GRAINGS_ISA to choose
+the instruction set that tests run with where they do not choose themselves.
 """
 
 from __future__ import annotations
