@@ -98,8 +98,8 @@ MUTANTS = (
         "e",
         "footprint of three standard deviations",
         GEOMETRY,
-        "fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30))",
-        "fma(level, d8(1 + 1e-5), d8(1e-5)), d8(4.5 * kLog2E))",
+        "fma(level, d8(1 + 1e-5), slack), d8(1e30))",
+        "fma(level, d8(1 + 1e-5), slack), d8(4.5 * kLog2E))",
     ),
     Mutant(
         "f",

@@ -13,12 +13,13 @@ namespace graings {
 
 inline int64_t pieces_of(int64_t count, int64_t piece) { return (count + piece - 1) / piece; }
 
-// Neighbours share Gaussians: a thread takes a few tiles at a time.
+// Neighbours share Gaussians and lines of memory: a thread takes a run of tiles at a time, a short one where many threads
+// would else wait for the last.
 template <class Visit>
 void each_tile(int threads, int64_t tiles, Visit visit) {
-    constexpr int64_t kTogether = 4;
-    parallel_for(threads, pieces_of(tiles, kTogether), [&](int worker, int64_t piece) {
-        for (int64_t tile = piece * kTogether; tile < std::min(tiles, (piece + 1) * kTogether); tile++) visit(worker, tile);
+    const int64_t together = std::clamp<int64_t>(tiles / (16 * threads), 4, 16);
+    parallel_for(threads, pieces_of(tiles, together), [&](int worker, int64_t piece) {
+        for (int64_t tile = piece * together; tile < std::min(tiles, (piece + 1) * together); tile++) visit(worker, tile);
     });
 }
 

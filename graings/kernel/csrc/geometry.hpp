@@ -102,7 +102,7 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
     const Settings& s = args.settings;
     const Inputs<R>& in = args.in;
     const double width = double(args.camera.width), height = double(args.camera.height);
-    const D half = d8(0.5), zero = d8(0), one = d8(1), w = d8(width), h = d8(height);
+    const D half = d8(0.5), zero = d8(0), one = d8(1), w = d8(width), h = d8(height), faintest = d8(__builtin_log2(s.alpha_min)), slack = d8(1e-5) - d8(1e-6) * faintest;
     for (int64_t group = begin; group < end; group += kGroup) {
         const Projected p = project_group(args.camera, s, in, group);
         D opacity, color[3];
@@ -112,10 +112,10 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         const D loose = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
         const D broad = sqrt(p.a), tall = sqrt(p.c), narrow = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
         const D sr = unit * narrow / p.v, sy = unit * tall * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
-        // Beyond `level` nothing is drawn. The pixel decides; what follows from it only saves work, so it is widened
-        // by more than any rounding of the exponent.
-        const D level = s.alpha_min > 0 ? log2(opacity * d8(1 / s.alpha_min)) : d8(1e30), root = sqrt(max(level, zero));
-        const D widened = min(fma(level, d8(1 + 1e-5), d8(1e-5)), d8(1e30));
+        // Where q exceeds `level` nothing is drawn. The pixel decides; what follows from it only saves work, so it is
+        // widened by more than any rounding of the exponent, which is as large as `faintest` there.
+        const D log_opacity = log2(opacity), level = s.alpha_min > 0 ? log_opacity - faintest : d8(1e30), root = sqrt(max(level, zero));
+        const D widened = min(fma(level, d8(1 + 1e-5), slack), d8(1e30));
         const D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
         // blocks with a pixel's centre in it
         const auto block = [](D pixel) { return floor(pixel * d8(1.0 / kBlock)); };
@@ -155,7 +155,7 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         radii[0] = select(drawn, radii[0], zero), radii[1] = select(drawn, radii[1], zero);
         store_columns<2>(args.means2d, group, end, center), store_columns<2>(args.radii, group, end, radii);
         store_columns<1>(args.depths, group, end, &p.z);
-        const D whole[3] = {p.x, p.y, p.slope}, pairs[4][2] = {{sr, sy}, {opacity, color[0]}, {color[1], color[2]}, {p.z, widened}};
+        const D whole[3] = {p.x, p.y, p.slope}, pairs[4][2] = {{sr, sy}, {log_opacity, color[0]}, {color[1], color[2]}, {p.z, widened}};
         put_records(args.records, group, end, whole, pairs);
         for (int lane = 0; lane < kGroup && group + lane < end; lane++) {
             const auto is = [&](uint32_t which) { return which >> lane & 1; };

@@ -68,7 +68,7 @@ GRAINGS_INLINE Distance<R> distance(const TileEntry<R>& entry, int block, P<R> r
 
 template <class R>
 GRAINGS_INLINE P<R> uncapped_alpha(const TileEntry<R>& entry, const Distance<R>& d) {
-    return p16(entry.look.opacity) * exp2_minus(fma(d.r, d.r, d.s * d.s));
+    return exp2(fnma(d.r, d.r, fnma(d.s, d.s, p16(entry.look.log_opacity))));
 }
 
 // What decides whether an entry counts in a pixel. Light so faint that no sum in R can see it counts as none: so much

@@ -29,10 +29,11 @@ struct Settings {
 enum Status : uint8_t { kDrawn, kNonFinite, kZeroQuat, kBehind, kFaint, kOutside, kStatuses };
 
 // One projected Gaussian: a cache line in single precision. With dx, dy = pixel - mean,
-// alpha = opacity * 2^-((sr (dx - slope dy))^2 + (sy dy)^2); nothing is drawn where the exponent exceeds `level`.
+// alpha = 2^(log_opacity - q) with q = (sr (dx - slope dy))^2 + (sy dy)^2; nothing is drawn where q exceeds `level`.
+// Logarithms are of base 2.
 template <class R>
 struct Look {
-    R sr, sy, opacity, red, green, blue, depth, level;
+    R sr, sy, log_opacity, red, green, blue, depth, level;
 };
 template <class R>
 struct alignas(64) Record {
