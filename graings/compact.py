@@ -26,6 +26,7 @@ from graings import constants
 from graings.checkpoint import load_model
 from graings.errors import CheckpointError
 from graings.model import Model, model_facts, model_from
+from graings.run_folder import newest_model
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 
@@ -99,8 +100,12 @@ def read_compact(path: Path) -> Model:
 
 
 def open_model(path: Path) -> Model:
-    """The model in a file of `write_compact`, or in a run or checkpoint folder. Raises `CheckpointError`."""
-    return read_compact(path) if path.is_file() else load_model(path)
+    """The model in a file of `write_compact`, or in a run or checkpoint folder. Raises `CheckpointError`.
+
+    A run whose checkpoints were removed to save space has its compact file still.
+    """
+    found = path if path.is_file() else newest_model(path)
+    return read_compact(found) if found is not None and found.is_file() else load_model(path)
 
 
 def can_be_seen(

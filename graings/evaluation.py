@@ -14,7 +14,7 @@ from pathlib import Path
 from graings.capture.capture import Capture, Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
-from graings.checkpoint import load_model
+from graings.compact import open_model
 from graings.errors import CheckpointError
 from graings.metrics import Lpips, SplitMetrics, measure
 from graings.render import render
@@ -65,7 +65,7 @@ def evaluate_run(run: Path, split: str, capture: Path | None = None) -> SplitMet
     The capture is found where it was at training time unless given. Raises `CheckpointError` when the run has
     no model or the capture is not the one it was trained on.
     """
-    model = load_model(run)
+    model = open_model(run)
     record = read_record(run)
     data = load_capture(capture or record.capture, model.config.capture)
     if data.content_hash != record.capture_hash:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from graings.checkpoint import load_model
+from graings.compact import open_model
 from graings.errors import CheckpointError
 from graings.picture import missing_reason, png
 from graings.plots import training_svg
@@ -53,7 +53,7 @@ def report_runs(runs: Sequence[Path], folder: Path, *, render: bool = True, budg
             omissions.append(f"{name}: not drawn, as asked")
             continue
         try:
-            rendered.append(render_part(name, load_model(_folder(path)), budget_s=budget_s))
+            rendered.append(render_part(name, open_model(_folder(path)), budget_s=budget_s))
         except (CheckpointError, ValueError) as error:
             omissions.append(f"{name}: not drawn ({error})")
     return _write(folder, document(training, rendered, omissions), pictures=True)

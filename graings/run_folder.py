@@ -65,6 +65,15 @@ def newest_checkpoint(run: Path) -> Path | None:
     return found[-1] if found else None
 
 
+def newest_model(run: Path) -> Path | None:
+    """Where the model of a run folder lies: its newest whole checkpoint, or where there is none its compact file.
+
+    None where there is neither.
+    """
+    compact = run / MODEL_FILE
+    return newest_checkpoint(run) or (compact if compact.is_file() else None)
+
+
 def best_checkpoint(run: Path) -> Path | None:
     """The checkpoint of the best held-out quality so far, or None; `newest_checkpoint` never is this folder."""
     folder = run / CHECKPOINTS / BEST

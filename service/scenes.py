@@ -1,6 +1,6 @@
 """Scenes: loaded models and the pool that draws them.
 
-Models are kept by what their checkpoint holds, the least recently used one leaves; images are drawn in a few threads,
+Models are kept by what their file holds, the least recently used one leaves; images are drawn in a few threads,
 and who finds too many waiting is turned away at once. Knows nothing of HTTP.
 """
 
@@ -15,11 +15,12 @@ import numpy as np
 from anyio import CapacityLimiter, to_thread
 
 from graings.camera import Camera
-from graings.checkpoint import load_model, newest_checkpoint
+from graings.compact import open_model
 from graings.encode import ImageFormat, encode_image
 from graings.errors import CheckpointError
 from graings.model import Model
 from graings.render import render
+from graings.run_folder import newest_model
 from service.problems import Busy
 
 _Key = tuple[str, int]
@@ -44,25 +45,25 @@ class Scenes:
         self._guard = threading.Lock()
 
     def load(self, run: Path) -> Model | None:
-        """The model in the newest checkpoint of a run folder that can be read, or None. Raises `CheckpointError`."""
+        """The model of a run folder, in its newest checkpoint that can be read, or None. Raises `CheckpointError`."""
         # One at a time: two requests for the same new checkpoint should read it once.
         with self._guard:
-            checkpoint = newest_checkpoint(run)
-            if checkpoint is None:
+            newest = newest_model(run)
+            if newest is None:
                 return None
-            key = _key(checkpoint)
+            key = _key(newest)
             model = self._loaded.get(key) if key else None
             if model is None:
                 try:
-                    model = load_model(run)
+                    model = open_model(run)
                 except CheckpointError:
-                    if newest_checkpoint(run) == checkpoint:
+                    if newest_model(run) == newest:
                         raise
-                    model = load_model(run)  # training went on and removed this one while it was read
-                if newest_checkpoint(run) != checkpoint:
+                    model = open_model(run)  # training went on and removed this one while it was read
+                if newest_model(run) != newest:
                     key = _key(model.path)
                 if key:
-                    self._forget(checkpoint.parent)
+                    self._forget(newest.parent)
                     self._loaded[key] = model
             if key:
                 self._loaded.move_to_end(key)
@@ -70,9 +71,9 @@ class Scenes:
                 self._loaded.popitem(last=False)
             return model
 
-    def _forget(self, checkpoints: Path) -> None:
-        """Older checkpoints of the same run are not asked for again."""
-        for key in [key for key in self._loaded if Path(key[0]).parent == checkpoints]:
+    def _forget(self, folder: Path) -> None:
+        """Older models of the same run are not asked for again."""
+        for key in [key for key in self._loaded if Path(key[0]).parent == folder]:
             del self._loaded[key]
 
 
@@ -99,9 +100,9 @@ class RenderPool:
         return encode_image(np.asarray(result.color, dtype=np.float32), picture.format)
 
 
-def _key(checkpoint: Path) -> _Key | None:
-    """What tells this checkpoint from any other that is or was in its place; None when it is gone."""
+def _key(path: Path) -> _Key | None:
+    """What tells this file or folder from any other that is or was in its place; None when it is gone."""
     try:
-        return str(checkpoint), checkpoint.stat().st_mtime_ns
+        return str(path), path.stat().st_mtime_ns
     except FileNotFoundError:
         return None

@@ -74,7 +74,7 @@ def job_resource(job: Job) -> JobResource:
         links["resume"] = f"{base}/resume"
     elif job.state is not JobState.SUCCEEDED:
         links["retry"] = f"{base}/retry"
-    if job.checkpoint is not None:
+    if job.checkpoint is not None or job.has_model:
         links["render"] = f"/render?job={job.id}"
     if job.has_metrics:
         links |= {"metrics": f"{base}/metrics", "curve": f"{base}/curve.svg", "report": f"{base}/report"}

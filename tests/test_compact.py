@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -15,8 +16,10 @@ from graings.checkpoint import load_model
 from graings.compact import can_be_seen, open_model, read_compact, write_compact
 from graings.config import make_config
 from graings.errors import CheckpointError
+from graings.evaluation import evaluate_run
 from graings.model import scene_bytes
 from graings.render import render
+from graings.run_folder import CHECKPOINTS, MODEL_FILE
 from graings.training.run import TrainingRun
 from tests.models import tiny_scene
 
@@ -41,6 +44,13 @@ def test_a_compact_model_shows_the_same_pictures_in_fewer_bytes(run: Path, tmp_p
         expected = render(model.scene, view.camera, view.time, model.background).color
         found = render(small.scene, view.camera, view.time, small.background).color
         assert float((found - expected).abs().max()) <= 2 / 255
+
+
+def test_a_run_without_checkpoints_is_opened_and_measured_by_its_compact_model(run: Path, tmp_path: Path) -> None:
+    without = tmp_path / "run"
+    shutil.copytree(run, without, ignore=shutil.ignore_patterns(CHECKPOINTS))
+    assert open_model(without).digest == read_compact(run / MODEL_FILE).digest
+    assert evaluate_run(without, "val").psnr == pytest.approx(evaluate_run(run, "val").psnr, abs=0.05)
 
 
 def test_everything_beside_the_tensors_comes_back_as_it_was(run: Path, tmp_path: Path) -> None:

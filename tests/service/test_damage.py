@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 from starlette.testclient import TestClient
 
+from graings.run_folder import CHECKPOINTS
 from jobs.engine import Engine
 from jobs.job import JobError
+from jobs.store import JobFolder
 from service.app import create_app
 from service.settings import Settings
 
@@ -78,3 +82,14 @@ def test_an_image_that_the_store_lost_comes_back_with_the_same_upload(
     images[0].unlink()
     assert client.post("/jobs", content=archive).status_code == 202
     assert sorted((settings.data / "captures").rglob("*.png")) == images
+
+
+def test_a_job_whose_checkpoints_were_removed_is_shown_from_its_compact_model(
+    client: TestClient, folder: JobFolder, model: str
+) -> None:
+    before = client.get(f"/render?job={model}&t=0.5", headers={"accept": "image/png"})
+    shutil.rmtree(folder.run / CHECKPOINTS)
+    after = client.get(f"/render?job={model}&t=0.5", headers={"accept": "image/png"})
+    assert (before.status_code, after.status_code) == (200, 200)
+    assert after.headers["X-Graings-Iteration"] == before.headers["X-Graings-Iteration"]
+    assert client.get(f"/jobs/{model}").json()["links"]["render"] == f"/render?job={model}"
