@@ -54,7 +54,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.render", "graings.scene", "graings.work_precision"),
     ),
     "graings.report_folder": (
-        *("graings.checkpoint", "graings.errors", "graings.picture", "graings.plots", "graings.render_plot"),
+        *("graings.compact", "graings.errors", "graings.picture", "graings.plots", "graings.render_plot"),
         *("graings.render_precision", "graings.report", "graings.tables", "graings.work_precision"),
     ),
     "graings.plan": ("graings.capture.capture", "graings.config"),
@@ -64,9 +64,12 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.camera", "graings.config", "graings.errors", "graings.model", "graings.run_folder"),
         *("graings.scene", "graings.units"),
     ),
-    "graings.compact": ("graings.checkpoint", "graings.constants", "graings.errors", "graings.model", "graings.scene"),
+    "graings.compact": (
+        *("graings.checkpoint", "graings.constants", "graings.errors", "graings.model", "graings.run_folder"),
+        "graings.scene",
+    ),
     "graings.evaluation": (
-        *("graings.capture", "graings.checkpoint", "graings.errors", "graings.metrics", "graings.render"),
+        *("graings.capture", "graings.compact", "graings.errors", "graings.metrics", "graings.render"),
         *("graings.report", "graings.run_folder", "graings.scene"),
     ),
     "graings.training": (
@@ -113,9 +116,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     # HTTP never trains.
     "service": (
-        *("service", "jobs", "graings", "graings.camera", "graings.capture.load", "graings.checkpoint"),
-        *("graings.config", "graings.encode"),
-        *("graings.errors", "graings.model", "graings.render", "graings.threads", "graings.units", "graings.viewpoint"),
+        *("service", "jobs", "graings", "graings.camera", "graings.capture.load", "graings.compact"),
+        *("graings.config", "graings.encode", "graings.errors", "graings.model", "graings.render"),
+        *("graings.run_folder", "graings.threads", "graings.units", "graings.viewpoint"),
     ),
     "service.demo": ("service", "jobs", "graings.capture.synthetic", "graings.errors"),
 }
