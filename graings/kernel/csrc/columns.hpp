@@ -25,6 +25,18 @@ GRAINGS_INLINE __m512 reordered(__m512 a, __m512 b, int part) {
     const __m512i at = _mm512_load_si512(places.at + 16 * part);
     return 8 * W > 16 ? _mm512_permutex2var_ps(a, at, b) : _mm512_permutexvar_ps(at, a);
 }
+
+// Eight registers of eight numbers as a square: rows become columns.
+GRAINGS_INLINE void transpose(__m512d (&x)[8]) {
+    __m512d two[2][4];  // columns odd, 2 + odd, 4 + odd and 6 + odd of rows 2k and 2k + 1
+    for (int k = 0; k < 4; k++) two[0][k] = _mm512_unpacklo_pd(x[2 * k], x[2 * k + 1]), two[1][k] = _mm512_unpackhi_pd(x[2 * k], x[2 * k + 1]);
+    for (int odd = 0; odd < 2; odd++) {
+        const __m512d a = _mm512_shuffle_f64x2(two[odd][0], two[odd][1], 0x44), b = _mm512_shuffle_f64x2(two[odd][2], two[odd][3], 0x44);
+        const __m512d c = _mm512_shuffle_f64x2(two[odd][0], two[odd][1], 0xEE), d = _mm512_shuffle_f64x2(two[odd][2], two[odd][3], 0xEE);
+        x[odd] = _mm512_shuffle_f64x2(a, b, 0x88), x[2 + odd] = _mm512_shuffle_f64x2(a, b, 0xDD);
+        x[4 + odd] = _mm512_shuffle_f64x2(c, d, 0x88), x[6 + odd] = _mm512_shuffle_f64x2(c, d, 0xDD);
+    }
+}
 #endif
 
 // The columns of a row-major [N, W] array for Gaussians begin..begin+7; past the end the last one repeats.
@@ -99,14 +111,8 @@ GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*p
         const __m256 low = _mm512_cvtpd_ps((__m512d)pairs[c - 3][0].v), high = _mm512_cvtpd_ps((__m512d)pairs[c - 3][1].v);
         column[c] = _mm512_castps_pd(_mm512_permutexvar_ps(alternate, _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1)));
     }
-    for (int odd = 0; odd < 2; odd++) {
-        __m512d two[4];  // columns 2k, 2k + 1 of rows 2m + odd, in quarter m
-        for (int k = 0; k < 4; k++) two[k] = odd ? _mm512_unpackhi_pd(column[2 * k], column[2 * k + 1]) : _mm512_unpacklo_pd(column[2 * k], column[2 * k + 1]);
-        const __m512d a = _mm512_shuffle_f64x2(two[0], two[1], 0x44), b = _mm512_shuffle_f64x2(two[2], two[3], 0x44);
-        const __m512d c = _mm512_shuffle_f64x2(two[0], two[1], 0xEE), d = _mm512_shuffle_f64x2(two[2], two[3], 0xEE);
-        _mm512_storeu_pd(to + odd, _mm512_shuffle_f64x2(a, b, 0x88)), _mm512_storeu_pd(to + 2 + odd, _mm512_shuffle_f64x2(a, b, 0xDD));
-        _mm512_storeu_pd(to + 4 + odd, _mm512_shuffle_f64x2(c, d, 0x88)), _mm512_storeu_pd(to + 6 + odd, _mm512_shuffle_f64x2(c, d, 0xDD));
-    }
+    transpose(column);
+    for (int row = 0; row < 8; row++) _mm512_storeu_pd(to + row, column[row]);
 }
 #endif
 
@@ -126,6 +132,85 @@ GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, 
     for (int c = 0; c < 8; c++) store_as<R>(y[c], pairs[c / 2][c % 2]);
     for (int i = 0; i < kGroup && begin + i < end; i++)
         records[begin + i] = {x[0][i], x[1][i], x[2][i], {y[0][i], y[1][i], y[2][i], y[3][i], y[4][i], y[5][i], y[6][i], y[7][i]}};
+}
+
+// Spans of Gaussians begin..begin+7, as far as they come before the end: how many tiles, and the sides in blocks.
+GRAINGS_INLINE void put_spans(Span* spans, int64_t begin, int64_t end, D tiles, const D (&sides)[4]) {
+#if defined(__AVX512F__)
+    if (begin + kGroup <= end) {
+        // four columns of 32 bits: nothing, the count, and the sides two by two
+        const auto whole = [](D x) { return _mm512_cvttpd_epu32((__m512d)x.v); };
+        const auto side = [&](const D& low, const D& high) { return whole(fma(splat<double, kGroup>(65536), high, low)); };
+        const __m512i a = _mm512_inserti32x8(_mm512_setzero_si512(), whole(tiles), 1);
+        const __m512i b = _mm512_inserti32x8(_mm512_castsi256_si512(side(sides[0], sides[1])), side(sides[2], sides[3]), 1);
+        for (int part = 0; part < 2; part++)
+            _mm512_storeu_ps(spans + begin + 4 * part, reordered<4, true>(_mm512_castsi512_ps(a), _mm512_castsi512_ps(b), part));
+        return;
+    }
+#endif
+    double count[kGroup], side[4][kGroup];
+    store(count, tiles);
+    for (int i = 0; i < 4; i++) store(side[i], sides[i]);
+    const auto block = [](double x) { return uint16_t(int32_t(x)); };
+    for (int i = 0; i < kGroup && begin + i < end; i++)
+        spans[begin + i] = {0, uint32_t(int32_t(count[i])), block(side[0][i]), block(side[1][i]), block(side[2][i]), block(side[3][i])};
+}
+
+// Small whole numbers of Gaussians begin..begin+7, as far as they come before the end.
+GRAINGS_INLINE void put_bytes(uint8_t* bytes, int64_t begin, int64_t end, D numbers) {
+#if defined(__AVX512F__)
+    if (begin + kGroup <= end) {
+        _mm_storeu_si64(bytes + begin, _mm256_cvtepi32_epi8(_mm512_cvttpd_epi32((__m512d)numbers.v)));
+        return;
+    }
+#endif
+    double whole[kGroup];
+    store(whole, numbers);
+    for (int i = 0; i < kGroup && begin + i < end; i++) bytes[begin + i] = uint8_t(int32_t(whole[i]));
+}
+
+// A pair's sums as they are added up, in as many numbers as lie between pairs.
+struct Sums { D first, rest; };
+
+// Adds a pair's sums if it has any. Half of the guesses whether it has are wrong, and each costs more than the addition.
+template <class R>
+GRAINGS_INLINE void add_sums(const R* of_pair, bool any, Sums& total) {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4) {
+        const __m512 sums = _mm512_maskz_loadu_ps(__mmask16(-int(any)) & ((1 << kSums) - 1), of_pair);
+        total.first.v += (Native<double>)_mm512_cvtps_pd(_mm512_castps512_ps256(sums));
+        total.rest.v += (Native<double>)_mm512_cvtps_pd(_mm512_extractf32x8_ps(sums, 1));
+        return;
+    }
+#endif
+    if (!any) return;
+    double rest[kGroup] = {};
+    for (int q = kGroup; q < kSums; q++) rest[q - kGroup] = double(of_pair[q]);
+    total.first = total.first + load_as<kGroup>(of_pair);
+    total.rest = total.rest + load<kGroup>(rest);
+}
+
+// The columns of eight rows of sums.
+GRAINGS_INLINE void columns_of_sums(const double (&rows)[kGroup][kSumStride], D (&columns)[kSums]) {
+    static_assert(kSums == kGroup + 2);
+#if defined(__AVX512F__)
+    __m512d x[8];
+    for (int i = 0; i < 8; i++) x[i] = _mm512_loadu_pd(rows[i]);
+    transpose(x);
+    for (int c = 0; c < 8; c++) columns[c].v = (Native<double>)x[c];
+    const auto two = [&](int row) { return _mm_loadu_pd(rows[row] + 8); };
+    const auto every_other = [&](int row) {
+        const __m512d half = _mm512_insertf64x2(_mm512_castpd128_pd512(two(row)), two(row + 2), 1);
+        return _mm512_insertf64x2(_mm512_insertf64x2(half, two(row + 4), 2), two(row + 6), 3);
+    };
+    const __m512d even = every_other(0), odd = every_other(1);
+    columns[8].v = (Native<double>)_mm512_unpacklo_pd(even, odd), columns[9].v = (Native<double>)_mm512_unpackhi_pd(even, odd);
+#else
+    double lanes[kSums][kGroup];
+    for (int i = 0; i < kGroup; i++)
+        for (int c = 0; c < kSums; c++) lanes[c][i] = rows[i][c];
+    for (int c = 0; c < kSums; c++) columns[c] = load<kGroup>(lanes[c]);
+#endif
 }
 
 }  // namespace graings::GRAINGS_ISA

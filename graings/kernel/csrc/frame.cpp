@@ -66,7 +66,7 @@ std::vector<Piece> Frame<R>::project(const ProjectArgs<R>& args, Binning<R>& bin
         Piece& piece = pieces[size_t(index)];
         piece.begin = index * kPiece, piece.end = std::min(count_, (index + 1) * kPiece), piece.worker = worker;
         kernels<R>().project(args, piece.begin, piece.end);
-        for (int64_t i = piece.begin; i < piece.end; i++) piece.statuses[status_[size_t(i)]]++;
+        for (int k = 0; k < kStatuses; k++) piece.statuses[size_t(k)] = std::count(status_.get() + piece.begin, status_.get() + piece.end, k);
         binning.count(piece);
     });
     for (const Piece& piece : pieces)

@@ -15,7 +15,7 @@ constexpr double kLog2E = 1.4426950408889634;
 // Everything about eight Gaussians that both directions need.
 struct Projected {
     D z, inverse_z, ratio_x, ratio_y, held_x, held_y;  // held: clamped before the Jacobian
-    D quat[4], inverse_norm, squared;
+    D quat[4], squared, inverse_squared;
     D rotation[9], scale[3];
     D affine[6];      // Jacobian times world-to-camera rotation, 2x3
     D m1[3], m2[3];   // rows of the factor of the covariance
@@ -36,7 +36,7 @@ GRAINGS_INLINE Limits limits(const Camera& k, const Settings& s) {
 GRAINGS_INLINE D dot3(const D* a, const D* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
 
 template <class R>
-GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings, const Inputs<R>& in, int64_t begin) {
+GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings, const Limits& limit, const Inputs<R>& in, int64_t begin) {
     Projected p;
     D mean[3], rho[3], offset[2];
     columns_of<3>(in.means, begin, in.count, mean);
@@ -57,20 +57,18 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
     p.inverse_z = d8(1) / p.z;
     p.ratio_x = camera[0] * p.inverse_z;
     p.ratio_y = camera[1] * p.inverse_z;
-    const Limits limit = limits(k, settings);
     p.held_x = clamp(p.ratio_x, limit.low_x, limit.high_x);
     p.held_y = clamp(p.ratio_y, limit.low_y, limit.high_y);
 
     p.squared = fma(p.quat[0], p.quat[0], fma(p.quat[1], p.quat[1], fma(p.quat[2], p.quat[2], p.quat[3] * p.quat[3])));
     p.finite = p.finite + (p.squared - p.squared);
-    p.inverse_norm = d8(1) / sqrt(p.squared);
-    for (int i = 0; i < 4; i++) p.quat[i] = p.quat[i] * p.inverse_norm;
-    const D w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3], one = d8(1), two = d8(2);
+    p.inverse_squared = d8(1) / p.squared;
+    const D w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3], one = d8(1), two = d8(2) * p.inverse_squared;
     D* r = p.rotation;
     r[0] = one - two * fma(y, y, z * z), r[1] = two * (x * y - w * z), r[2] = two * fma(x, z, w * y);
     r[3] = two * fma(x, y, w * z), r[4] = one - two * fma(x, x, z * z), r[5] = two * (y * z - w * x);
     r[6] = two * (x * z - w * y), r[7] = two * fma(y, z, w * x), r[8] = one - two * fma(x, x, y * y);
-    for (int i = 0; i < 3; i++) p.scale[i] = exp(rho[i]);
+    for (int i = 0; i < 3; i++) p.scale[i] = exp<R>(rho[i]);
 
     const D fx = d8(k.fx) * p.inverse_z, fy = d8(k.fy) * p.inverse_z;
     for (int i = 0; i < 3; i++) {
@@ -98,23 +96,26 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
 }
 
 template <class R>
-static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
+static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
+    const ProjectArgs<R> args = given;  // a byte stored to `status` may not change these
     const Settings& s = args.settings;
     const Inputs<R>& in = args.in;
+    const Limits limit = limits(args.camera, s);
     const double width = double(args.camera.width), height = double(args.camera.height);
     const D half = d8(0.5), zero = d8(0), one = d8(1), w = d8(width), h = d8(height), faintest = d8(__builtin_log2(s.alpha_min)), slack = d8(1e-5) - d8(1e-6) * faintest;
     for (int64_t group = begin; group < end; group += kGroup) {
-        const Projected p = project_group(args.camera, s, in, group);
         D opacity, color[3];
         columns_of<1>(in.opacities, group, in.count, &opacity);
         columns_of<3>(in.colors, group, in.count, color);
+        // early: a long chain of its own, which fills the pauses of the other one
+        const D log_opacity = log2<R>(opacity), level = s.alpha_min > 0 ? log_opacity - faintest : d8(1e30), root = sqrt(max(level, zero));
+        const Projected p = project_group(args.camera, s, limit, in, group);
         const D footprint = (p.x - p.x) + (p.y - p.y) + (p.slope - p.slope) + (p.v - p.v) + (p.c - p.c) + (p.a - p.a);
         const D loose = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
         const D broad = sqrt(p.a), tall = sqrt(p.c), narrow = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
         const D sr = unit * narrow / p.v, sy = unit * tall * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
         // Where q exceeds `level` nothing is drawn. The pixel decides; what follows from it only saves work, so it is
         // widened by more than any rounding of the exponent, which is as large as `faintest` there.
-        const D log_opacity = log2(opacity), level = s.alpha_min > 0 ? log_opacity - faintest : d8(1e30), root = sqrt(max(level, zero));
         const D widened = min(fma(level, d8(1 + 1e-5), slack), d8(1e30));
         const D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
         // blocks with a pixel's centre in it
@@ -123,11 +124,10 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         const D first_y = zero - floor(zero - clamp(p.y - high - half, zero, h)), last_y = floor(clamp(p.y + high - half, zero - one, h - one));
         const D exact = (s.alpha_min > 0 ? root : d8(__builtin_inf())) * radius;
         D radii[2] = {exact * broad, exact * tall};
-        double box[4][kGroup];
-        store(box[0], block(first_x)), store(box[1], block(last_x)), store(box[2], block(first_y)), store(box[3], block(last_y));
+        D sides[4] = {block(first_x), block(last_x), block(first_y), block(last_y)};
         auto tiled = (first_x <= last_x) & (first_y <= last_y), inside = zero <= zero;
         if (s.compat) {
-            double x[kGroup], y[kGroup], a[kGroup], c[kGroup], slope[kGroup], square[kGroup], hit[kGroup];
+            double x[kGroup], y[kGroup], a[kGroup], c[kGroup], slope[kGroup], square[kGroup], hit[kGroup], box[4][kGroup];
             store(x, p.x), store(y, p.y), store(a, p.a), store(c, p.c), store(slope, p.slope);
             for (int i = 0; i < kGroup; i++) {
                 const double covariance = slope[i] * c[i], difference = 0.5 * (a[i] - c[i]);
@@ -139,6 +139,7 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
                 hit[i] = square[i] > 0 && box[0][i] <= box[1][i] && box[2][i] <= box[3][i];
                 for (int side = 0; side < 4; side++) box[side][i] = Span::kPerTile * box[side][i] + side % 2 * (Span::kPerTile - 1);  // whole tiles
             }
+            for (int side = 0; side < 4; side++) sides[side] = load<kGroup>(box[side]);
             radii[0] = radii[1] = load<kGroup>(square);
             tiled = inside = zero < load<kGroup>(hit);
         } else
@@ -149,55 +150,52 @@ static void project(const ProjectArgs<R>& args, int64_t begin, int64_t end) {
         const auto finite = is_zero(loose) & (largest <= d8(s.far)), turned = d8(1e-24) <= p.squared, ahead = d8(s.near) < p.z;
         const auto seen = d8(s.alpha_min) < opacity, bounded = is_zero(footprint);
         const auto drawn = finite & turned & ahead & seen & bounded & inside;
-        const uint32_t is_drawn = bits(drawn), is_tiled = is_drawn & bits(tiled);
-        const uint32_t is_finite = bits(finite), is_turned = bits(turned), is_ahead = bits(ahead), is_seen = bits(seen), is_bounded = bits(bounded);
         const D center[2] = {select(drawn, p.x, zero), select(drawn, p.y, zero)};
         radii[0] = select(drawn, radii[0], zero), radii[1] = select(drawn, radii[1], zero);
         store_columns<2>(args.means2d, group, end, center), store_columns<2>(args.radii, group, end, radii);
         store_columns<1>(args.depths, group, end, &p.z);
         const D whole[3] = {p.x, p.y, p.slope}, pairs[4][2] = {{sr, sy}, {log_opacity, color[0]}, {color[1], color[2]}, {p.z, widened}};
         put_records(args.records, group, end, whole, pairs);
-        for (int lane = 0; lane < kGroup && group + lane < end; lane++) {
-            const auto is = [&](uint32_t which) { return which >> lane & 1; };
-            args.status[group + lane] = is(is_drawn) ? kDrawn : !is(is_finite) ? kNonFinite : !is(is_turned) ? kZeroQuat : !is(is_ahead) ? kBehind
-                                        : !is(is_seen) ? kFaint : !is(is_bounded) ? kNonFinite : kOutside;
-            Span span{};
-            if (is(is_tiled)) {
-                const auto side = [&](int which) { return uint16_t(int32_t(box[which][lane])); };
-                span = {0, 0, side(0), side(1), side(2), side(3)};
-                span.count = span.tiles();
-            }
-            args.spans[group + lane] = span;
-        }
+        const auto tile = [](D block) { return floor(block * d8(1.0 / Span::kPerTile)); };
+        const D tiles = (tile(sides[1]) - tile(sides[0]) + one) * (tile(sides[3]) - tile(sides[2]) + one);
+        const auto on_tiles = drawn & tiled;
+        for (D& side : sides) side = select(on_tiles, side, zero);
+        put_spans(args.spans, group, end, select(on_tiles, tiles, zero), sides);
+        D status = d8(kOutside);  // the first reason of all counts
+        status = select(bounded, status, d8(kNonFinite)), status = select(seen, status, d8(kFaint)), status = select(ahead, status, d8(kBehind));
+        status = select(turned, status, d8(kZeroQuat)), status = select(finite, status, d8(kNonFinite)), status = select(drawn, d8(kDrawn), status);
+        put_bytes(args.status, group, end, status);
     }
 }
 
 // Order of the sums per (tile, Gaussian); E: -dL/de of the exponent e, times the scaled distances r and s.
 enum Sum { kE, kR, kS, kRR, kRS, kSS, kRed, kGreen, kBlue, kDepth };
 
+constexpr int kSumsAhead = 16;  // of which the memory comes near
+
 template <class R>
 static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin, int64_t end) {
     const Camera& k = args.camera;
     const Inputs<R>& in = args.in;
+    const Limits limit = limits(k, args.settings);
     for (int64_t group = begin; group < end; group += kGroup) {
-        double sums[kGroup][kSums], on_[kGroup] = {};
-        R opacity_[kGroup];
+        alignas(64) double sums[kGroup][kSumStride];
+        double on_[kGroup];
         bool drawn = false;
         for (int lane = 0; lane < kGroup; lane++) {
-            const int64_t i = group + lane;
-            opacity_[lane] = 1;
-            if (i >= end || args.status[i] != kDrawn) {
-                std::memset(sums[lane], 0, sizeof sums[lane]);
-                continue;
-            }
-            drawn = true, on_[lane] = 1;
-            opacity_[lane] = in.opacities[i];
-            const R* of_pair = args.sums + int64_t(args.spans[i].begin) * kSumStride;
-            double total[kSums] = {};
-            for (uint32_t pair = 0; pair < args.spans[i].count; pair++, of_pair += kSumStride)
-                if (args.written[args.spans[i].begin + pair])
-                    for (int q = 0; q < kSums; q++) total[q] += double(of_pair[q]);
-            std::memcpy(sums[lane], total, sizeof total);
+            const int64_t i = group + lane < end ? group + lane : end - 1;
+            const bool own = group + lane < end && args.status[i] == kDrawn;
+            on_[lane] = own, drawn |= own;
+            const uint32_t count = own ? args.spans[i].count : 0, first = count ? args.spans[i].begin : 0;
+            Sums total{d8(0), d8(0)};
+            const auto add = [&](uint32_t place, bool there) {
+                const R* of_pair = args.sums + int64_t(place) * kSumStride;
+                __builtin_prefetch(of_pair + kSumsAhead * kSumStride);
+                add_sums(of_pair, bool(args.written[place]) & there, total);
+            };
+            add(first, count > 0), add(first + (count > 1), count > 1);  // most have no more: no branch to guess
+            for (uint32_t place = first + 2; place < first + count; place++) add(place, true);
+            store(sums[lane], total.first), store(sums[lane] + kGroup, total.rest);
         }
         const D none[4] = {d8(0), d8(0), d8(0), d8(0)};
         const auto put = [&](const D* means, const D* quats, const D* log_scales, const D* opacity, const D* colors, const D* offset) {
@@ -210,16 +208,18 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
             put(none, none, none, none, none, none);
             continue;
         }
-        const Projected p = project_group(k, args.settings, in, group);
+        const Projected p = project_group(k, args.settings, limit, in, group);
         D total[kSums];
-        columns_of<kSums>(sums[0], 0, kGroup, total);
+        columns_of_sums(sums, total);
         const D ln2 = d8(kLn2), inverse_v = d8(1) / p.v, inverse_sr = d8(1 / kRootHalfLog2E) * sqrt(p.v), inverse_sy = d8(1 / kRootHalfLog2E) * sqrt(p.c);
         const D across = inverse_sr * inverse_v, g_x = total[kR] * across;
         const D g_y = total[kS] * inverse_sy * p.inverse_c - p.slope * g_x;
         const D g_slope = total[kRS] * inverse_sy * across;
         const D g_v = ln2 * total[kRR] * inverse_v;
         const D g_c = ln2 * total[kSS] * p.inverse_c;
-        const D g_opacity = total[kE] / load_as<kGroup>(opacity_);
+        D opacity;
+        columns_of<1>(in.opacities, group, in.count, &opacity);
+        const D g_opacity = total[kE] / opacity;
 
         const D bent = g_slope * p.inverse_c, two = d8(2);
         D gn1[3], gn2[3], g_rho[3], g_affine[6];
@@ -253,7 +253,7 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         q[1] = two * (b * (V[3] + V[1]) + d * (V[2] + V[6]) + w * (V[7] - V[5]) - two * a * (V[4] + V[8]));
         q[2] = two * (a * (V[1] + V[3]) + d * (V[5] + V[7]) + w * (V[2] - V[6]) - two * b * (V[0] + V[8]));
         q[3] = two * (a * (V[2] + V[6]) + b * (V[5] + V[7]) + w * (V[3] - V[1]) - two * d * (V[0] + V[4]));
-        const D radial = q[0] * w + q[1] * a + q[2] * b + q[3] * d;
+        const D radial = (q[0] * w + q[1] * a + q[2] * b + q[3] * d) * p.inverse_squared;
 
         // what was not drawn has no gradient, whatever its lanes hold
         const auto on = zero < load<kGroup>(on_);
@@ -263,8 +263,9 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
             means[i] = kept(fma(d8(w2c[i]), camera[0], fma(d8(w2c[3 + i]), camera[1], d8(w2c[6 + i]) * camera[2])));
             log_scales[i] = kept(g_rho[i]), colors[i] = kept(total[kRed + i]);
         }
-        for (int i = 0; i < 4; i++) quats[i] = kept((q[i] - radial * p.quat[i]) * p.inverse_norm);
-        const D opacity = kept(g_opacity), offset[2] = {kept(g_x), kept(g_y)};
+        for (int i = 0; i < 4; i++) quats[i] = kept((q[i] - radial * p.quat[i]) * p.inverse_squared);
+        opacity = kept(g_opacity);
+        const D offset[2] = {kept(g_x), kept(g_y)};
         put(means, quats, log_scales, &opacity, colors, offset);
     }
 }

@@ -302,14 +302,19 @@ GRAINGS_VEC Vec<T, N> floor(Vec<T, N> x) {
 #endif
     } else return {floor(x.lo), floor(x.hi)};
 }
-// e^x, with x limited to [-708, 709]
-template <int N> GRAINGS_INLINE Vec<double, N> exp(Vec<double, N> x) {
+// e^x, with x limited to [-708, 709]; for R = float to 6e-11, more than it can tell
+template <class R, int N> GRAINGS_INLINE Vec<double, N> exp(Vec<double, N> x) {
     constexpr double magic = 6755399441055744;
     x = clamp(x, splat<double, N>(-708), splat<double, N>(709));
     auto shifted = fma(x, splat<double, N>(1.4426950408889634), splat<double, N>(magic));
     auto n = shifted - splat<double, N>(magic);
     auto f = fma(n, splat<double, N>(-6.93147180369123816490e-01), x);
     f = fma(n, splat<double, N>(-1.90821492927058770002e-10), f);
+    if constexpr (sizeof(R) == 4) {  // minimax with the first two terms fixed
+        constexpr double c[] = {1.9790352363448812e-04, 1.3944648662873452e-03, 8.333497008487295e-03, 4.166629509252087e-02,
+                                0.16666665869415376, 0.5000000067642875, 1.0, 1.0};
+        return scale_by_power(polynomial(f, c), shifted);
+    }
     constexpr double c[] = {1.6059043836821613e-10, 2.08767569878681e-09, 2.505210838544172e-08, 2.755731922398589e-07,
                             2.7557319223985893e-06, 2.48015873015873e-05, 1.984126984126984e-04, 1.388888888888889e-03,
                             8.333333333333333e-03, 4.1666666666666664e-02, 0.16666666666666666, 0.5, 1.0, 1.0};
@@ -327,13 +332,17 @@ template <int N> GRAINGS_INLINE void split_power(Vec<double, N> x, Vec<double, N
         split_power(x.hi, power.hi, fraction.hi);
     }
 }
-// log2 of positive normal numbers, to 2e-16 relative to max(1, |result|)
-template <int N> GRAINGS_INLINE Vec<double, N> log2(Vec<double, N> x) {
+// log2 of positive normal numbers, to 2e-16 relative to max(1, |result|); for R = float to 2e-12
+template <class R, int N> GRAINGS_INLINE Vec<double, N> log2(Vec<double, N> x) {
     Vec<double, N> power, fraction;
     split_power(x, power, fraction);  // fraction in [sqrt(1/2), sqrt(2))
     const auto one = splat<double, N>(1);
     const auto s = (fraction - one) / (fraction + one), q = s * s;
     // 2 / ln 2 * atanh(s) with |s| <= 0.1716
+    if constexpr (sizeof(R) == 4) {
+        constexpr double c[] = {0.3427913402208697, 0.41153628116551366, 0.5770865938479515, 0.9617966487926921, 2.885390081843991};
+        return fma(polynomial(q, c), s, power);
+    }
     constexpr double c[] = {0.1373995277037108, 0.15186263588304877, 0.16972882833987804, 0.19235933878519512, 0.22195308321368667, 0.2623081892525388,
                             0.3205988979753252, 0.4121985831111324,  0.5770780163555853,  0.9617966939259756,  2.8853900817779268};
     return fma(polynomial(q, c), s, power);
