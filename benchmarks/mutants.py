@@ -171,8 +171,8 @@ MUTANTS = (
         "n",
         "rectangle of blocks one too narrow on the right",
         GEOMETRY,
-        "store(box[1], block(last_x))",
-        "store(box[1], block(last_x) - one)",
+        "block(first_x), block(last_x), block(first_y)",
+        "block(first_x), block(last_x) - one, block(first_y)",
     ),
     Mutant(
         "o",
@@ -229,6 +229,27 @@ MUTANTS = (
         GEOMETRY,
         "g_slope = total[kRS]",
         "g_slope = d8(0.5) * total[kRS]",
+    ),
+    Mutant(
+        "place-lost",
+        "the third of a Gaussian's places forgotten",
+        GEOMETRY,
+        "for (uint32_t place = first + 2;",
+        "for (uint32_t place = first + 3;",
+    ),
+    Mutant(
+        "unwritten",
+        "sums taken where none were written",
+        GEOMETRY,
+        "add_sums(of_pair, bool(args.written[place]) & there, total);",
+        "add_sums(of_pair, there, total);",
+    ),
+    Mutant(
+        "reason",
+        "the last reason not to draw named, not the first",
+        GEOMETRY,
+        "status = select(turned, status, d8(kZeroQuat)), status = select(finite, status, d8(kNonFinite)),",
+        "status = select(finite, status, d8(kNonFinite)), status = select(turned, status, d8(kZeroQuat)),",
     ),
     Mutant(
         "cap-passed",

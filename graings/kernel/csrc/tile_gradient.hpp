@@ -142,15 +142,16 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     const auto record_of = [&](int j) -> const Record<R>& { return args.records[entries[j].id]; };
     const auto sums_of = [&](int j) { return all.sums + size_t(entries[j].place) * kSumStride; };
 
-    const Totals nothing{zero, zero, zero, zero, zero, zero, zero, zero, zero, zero};
+    const auto clear = [&](Totals& t) { t.e = t.er = t.es = t.err = t.ers = t.ess = t.red = t.green = t.blue = t.depth = zero; };
     const auto put = [&](const Totals& total, int j) {
-        const P<R> totals[kSums] = {total.e, total.er, total.es, total.err, total.ers, total.ess, total.red, total.green, total.blue, total.depth};
+        const P<R> totals[kSums] = {total.e, total.er, total.es, total.err, total.ers, total.ess, total.red, total.green, total.blue, Extra ? total.depth : zero};
         add_lanes(totals, sums_of(j));
     };
     // Where there are registers enough, a block is looked at before the one looked at last is added up, so that neither
     // waits for the other.
     constexpr bool kOverlap = kOne<R, kLanes>;
-    Totals total = nothing;
+    Totals total;
+    clear(total);
     [[maybe_unused]] Seen seen;
     int open = -1;  // entry of the block looked at last
     const auto close = [&] {
@@ -169,14 +170,14 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         if constexpr (kOverlap) {
             Seen next = look(entry, mask);
             if (open >= 0) close();
-            open = j, seen = next, total = nothing;
+            open = j, seen = next, clear(total);
             while (mask &= mask - 1) {
                 next = look(entry, mask);
                 add(total, entry, seen);
                 seen = next;
             }
         } else {
-            total = nothing;
+            clear(total);
             for (; mask; mask &= mask - 1) add(total, entry, look(entry, mask));
             put(total, j);
         }
