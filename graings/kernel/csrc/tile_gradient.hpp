@@ -9,16 +9,23 @@ namespace graings::GRAINGS_ISA {
 // out[q] = sum of the 16 numbers of v[q], for all sums of an entry at once; writes up to kSumStride numbers.
 template <class R>
 GRAINGS_INLINE void add_lanes(const P<R> (&v)[kSums], R* out) {
-#if defined(__AVX2__)
+#if defined(__AVX512F__)
+    if constexpr (sizeof(R) == 4) {
+        // Halve four times, two vectors into one; each keeps its own part of the lanes.
+        const auto quarters = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x88), _mm512_shuffle_f32x4(a, b, 0xDD)); };
+        const auto pairs = [](__m512 a, __m512 b) { return _mm512_add_ps(_mm512_shuffle_ps(a, b, 0x88), _mm512_shuffle_ps(a, b, 0xDD)); };
+        const auto of = [&](int q) { return (__m512)v[q].v; };
+        const auto four = [&](int q) { return quarters(quarters(of(q), of(q + 1)), quarters(of(q + 2), of(q + 3))); };
+        const __m512 two = quarters(of(8), of(9)), rest = quarters(two, two);
+        const __m512 by_four = pairs(pairs(four(0), four(4)), pairs(rest, rest));  // sum q at 4 (q % 4) + q / 4
+        const __m512i place = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
+        _mm512_storeu_ps(out, _mm512_permutexvar_ps(place, by_four));
+        return;
+    }
+#elif defined(__AVX2__)
     if constexpr (sizeof(R) == 4) {
         // Halve four times: the first time alone, then two vectors into one; each keeps its own part of the lanes.
-        const auto half = [](const P<R>& x) {
-#if defined(__AVX512F__)
-            return _mm256_add_ps(_mm512_castps512_ps256((__m512)x.v), _mm512_extractf32x8_ps((__m512)x.v, 1));
-#else
-            return _mm256_add_ps((__m256)x.lo.v, (__m256)x.hi.v);
-#endif
-        };
+        const auto half = [](const P<R>& x) { return _mm256_add_ps((__m256)x.lo.v, (__m256)x.hi.v); };
         const auto pairs = [](__m256 a, __m256 b) { return _mm256_add_ps(_mm256_shuffle_ps(a, b, 0x88), _mm256_shuffle_ps(a, b, 0xDD)); };
         __m256 two[5];
         for (int i = 0; i < 5; i++) two[i] = pairs(half(v[2 * i]), half(v[2 * i + 1]));
