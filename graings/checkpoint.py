@@ -108,7 +108,7 @@ def save_checkpoint(
         part.rename(final)
         shutil.rmtree(old, ignore_errors=True)
         _flush(folder)
-    except OSError as error:
+    except (OSError, SafetensorError) as error:  # the library has its own for a full disk
         shutil.rmtree(part, ignore_errors=True)
         raise CheckpointError(
             f"{final}: cannot write the checkpoint ({error}). Free some space; earlier ones are kept."

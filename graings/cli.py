@@ -7,6 +7,7 @@ Reads arguments, calls the library, prints, and turns errors into one line and a
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import sys
@@ -46,6 +47,11 @@ EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (
     (DivergedError, 70),
     (OSError, 74),
 )
+REMEDIES: Final[dict[int | None, str]] = {
+    errno.ENOENT: "Check the path.",
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Free some space there; training goes on with --resume."),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "Name another place, or have this one opened to you."),
+}
 EPILOG: Final = (
     "Exit codes: 0 done; 1 a bug; 2 wrong usage or option; 65 the capture or checkpoint cannot be used; 69 the kernel "
     "or a package is missing; 70 training diverged; 74 a file cannot be read or written; 130 interrupted (143 by "
@@ -218,8 +224,9 @@ def _words(error: Exception) -> str:
         place = Path(str(error.filename))
         taken = next((one for one in (place, *place.parents) if one.is_file()), place)
         return f"{taken}: is a file where a folder is wanted. Name another place."
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}."
+    if isinstance(error, OSError) and error.strerror:
+        file = "" if error.filename is None else f"{error.filename}: "  # a full disk is told of without its file
+        return f"{file}{error.strerror}. {REMEDIES.get(error.errno, 'Name another place.')}"
     return str(error)
 
 

@@ -166,8 +166,17 @@ def test_a_pose_file_without_a_key_is_refused_by_its_name(
     assert "fy, cx, cy, width, height missing" in " ".join(capsys.readouterr().err.replace("│", " ").split())
 
 
-def test_a_missing_pose_file_is_an_input_error(run: Path, tmp_path: Path) -> None:
+def test_a_missing_pose_file_is_an_input_error(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("render", run, "--pose", tmp_path / "none.json", "-o", tmp_path / "view.png") == 74
+    assert "none.json: No such file or directory. Check the path." in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.skipif(not Path("/sys").is_dir(), reason="no folder that nobody may write to")
+def test_a_place_that_nobody_may_write_to_is_named_with_a_remedy(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert graings("render", run, "-o", "/sys/view.png") == 74
+    words = " ".join(capsys.readouterr().err.split())
+    assert "/sys/view.png" in words
+    assert "Name another place" in words
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import time
 from pathlib import Path
 from typing import Any
@@ -222,6 +223,30 @@ def test_a_damaged_checkpoint_is_named(capture: Path, tmp_path: Path) -> None:
     (newest / "scene.safetensors").write_bytes(b"not a tensor file")
     with pytest.raises(CheckpointError, match="damaged checkpoint"):
         load_model(tmp_path / "run")
+
+
+@pytest.mark.parametrize("room", [4_096, 600_000])  # not enough for the scene; for the scene, not for the state
+def test_a_disk_too_full_keeps_the_checkpoint_before_and_says_what_to_do(
+    capture: Path, tmp_path: Path, room: int
+) -> None:
+    folder = tmp_path / "run"
+    run = TrainingRun.create(capture, folder, _config())
+    steps = iter(run)
+    next(steps)
+    run.save()
+    before = newest_checkpoint(folder)
+    next(steps)
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limit[1]))
+    try:
+        with pytest.raises(CheckpointError, match=r"00000002: cannot write the checkpoint .* Free some space"):
+            run.save()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert [one.name for one in (folder / "checkpoints").iterdir()] == [before.name]
+    assert load_model(folder).iteration == 1
+    run.save()  # there is room again
+    assert load_model(folder).iteration == 2
 
 
 @pytest.mark.parametrize("file", ["scene.safetensors", "state.safetensors", "checkpoint.json"])
