@@ -27,7 +27,12 @@ class Part(BaseModel):
 Stored = TypeVar("Stored", bound=Part)
 
 # What an older file does not say of a model's shape is as it was before there was a choice.
-SHAPE_BEFORE: Final[dict[str, Any]] = {"deform_time": "input", "time_width": 64, "direction_degree": 1}
+SHAPE_BEFORE: Final[dict[str, Any]] = {
+    "deform_time": "input",
+    "time_width": 64,
+    "direction_degree": 1,
+    "head_width": 32,
+}
 
 
 Channel = Annotated[float, Field(ge=0, le=1)]
@@ -60,7 +65,7 @@ class SceneConfig(Part):
 
     children: int = Field(10, ge=1, le=32, description="Child Gaussians per anchor (k).")
     feature_dim: int = Field(32, ge=1, le=256, description="Length of the anchor feature (d_f).")
-    head_width: int = Field(32, ge=4, le=512, description="Hidden width of the colour, opacity and residual heads.")
+    head_width: int = Field(96, ge=4, le=512, description="Hidden width of the colour, opacity and residual heads.")
     static_width: int = Field(64, ge=4, le=512, description="Hidden width of StaticMLP.")
     deform_width: int = Field(128, ge=4, le=1024, description="Hidden width of DeformNet.")
     deform_depth: int = Field(3, ge=1, le=12, description="Hidden layers of DeformNet.")
