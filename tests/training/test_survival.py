@@ -95,12 +95,13 @@ def test_a_run_with_a_bad_loss_is_as_good_as_a_clean_one(
 def test_a_bad_moment_is_noticed_and_training_goes_back(micro: Path, moment: str) -> None:
     """E02, one number of Adam's state at step 52: it reaches the parameter, not the model that is kept.
 
-    Half the rates cost a run this short several decibels; going back must cost none beyond those.
+    Half the rates, and the steps thrown away, cost a run this short; going back must cost none beyond those.
     """
     slower = micro_trainer(micro)
     steps(slower, 50)
     slower.optimizer.damping = 0.5
-    steps(slower, 150)
+    slower.iteration = 55  # noticed here: the schedule runs on, the five steps are lost
+    steps(slower, 145)
     trainer = micro_trainer(micro)
     steps(trainer, 52)
     trainer.optimizer.adam.state[trainer.scene.scaffold.features][moment][3, 2] = BAD
@@ -370,8 +371,11 @@ def test_saturated_colours_come_back(micro: Path, bias: float, ground: str) -> N
 
 
 def test_a_saturated_opacity_has_a_gradient_and_falls_where_the_data_want_it(micro: Path) -> None:
-    """E11: at 20 the gradient is there; from 12 on it is large enough for Adam's epsilon."""
-    trainer = micro_trainer(micro, **{"rates.opacity": [0.05, 0.05]})
+    """E11: at 20 the gradient is there; from 12 on it is large enough for Adam's epsilon.
+
+    A step moves a score by its rate times the hidden units that are awake: at 0.05, 96 of them leap to a score of 40.
+    """
+    trainer = micro_trainer(micro, **{"rates.opacity": [0.016, 0.016]})
     last = trainer.scene.appearance.opacity[-1]
     assert isinstance(last, nn.Linear)
     _drive(trainer, last, 20.0)
@@ -385,8 +389,9 @@ def test_a_saturated_opacity_has_a_gradient_and_falls_where_the_data_want_it(mic
     _drive(trainer, last, 12.0)
     before = quality(trainer)
     steps(trainer, 200)
-    assert float(last.bias.detach().min()) < 11.0
-    assert quality(trainer) > before
+    composed = trainer.scene.compose(frame.camera.center, frame.time)
+    assert float(composed.opacities.min()) < 0.5  # of every slot; at a bias of 12 each is 1
+    assert quality(trainer) > before + 10
 
 
 def test_a_scene_in_which_all_is_hidden_is_shown_again_once_and_then_goes_back(micro: Path) -> None:
