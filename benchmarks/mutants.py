@@ -308,6 +308,13 @@ MUTANTS = (
         "            open = j",
     ),
     Mutant(
+        "ready-places",
+        "an entry made ready in the place of the one that is still open",
+        TILE_GRADIENT,
+        "    constexpr int kReady = 16;\n    static_assert(kReady > kReadyAhead + 1);\n",
+        "    constexpr int kReady = 9;\n",
+    ),
+    Mutant(
         "group-split",
         "gradient of a group lost where pieces of work meet",
         f"{SOURCE}/perceptron.cpp",

@@ -13,7 +13,7 @@ from graings.gaussians import Gaussians
 from graings.raster import reference
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
-from tests.raster.comparison import draw, upstream
+from tests.raster.comparison import draw, relative, upstream
 from tests.scenes import cast, gaussians, pinhole, rows
 
 
@@ -141,3 +141,23 @@ def test_a_line_that_meets_blocks_in_their_corners_only_is_drawn_there(dtype: to
         assert torch.equal(ours, torch.where(raw >= least, raw, 0.0)), i
         met += int((ours > 0).sum())
     assert met > 100
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("period", [8, 16, 32, 64])
+def test_gaussians_that_silent_ones_lie_between_keep_their_gradients(period: int, dtype: torch.dtype, isa: str) -> None:
+    """One in `period` lies where the loss looks: however many entries are passed over, what waits is not lost."""
+    count = 5 * period
+    heard = torch.arange(count) % period == 0
+    batch, camera = gaussians(count, 77, log_scales=(-3.5, -3.2), opacity=(0.1, 0.3)), pinhole(16, 16)
+    depths = torch.linspace(2.0, 2.5, count, dtype=torch.float64)
+    aside = torch.where(heard, -0.14, 0.14).double() * depths  # the first block of the tile, or the last
+    batch = replace(batch, means=torch.stack([aside, aside, depths], 1))
+    cotangent = upstream(camera)
+    cotangent[4:], cotangent[:, 4:] = 0, 0
+    ours = draw(rasterize, cast(batch, dtype), camera, cotangent).gradients
+    oracle = draw(reference.rasterize, batch, camera, cotangent).gradients
+    assert (oracle["means"][heard].norm(dim=1) > 1e-3).all()
+    assert (oracle["means"][~heard] == 0).all()
+    for name, expected in oracle.items():
+        assert relative(ours[name], expected) < (1e-12 if dtype == torch.float64 else 1e-5), name

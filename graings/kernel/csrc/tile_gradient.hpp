@@ -142,12 +142,22 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         total.red = fma(weight, g0, total.red), total.green = fma(weight, g1, total.green), total.blue = fma(weight, g2, total.blue);
     };
 
-    constexpr int kAhead = 32;  // entries prepared at a time; meanwhile the memory of the next ones comes near
-    TileEntry<R> chunk[2 * kAhead];
+    // How many entries before its turn an entry's record, and where its sums go, come near, and it is prepared.
+    constexpr int kRecordAhead = 32, kSumsAhead = 16, kReadyAhead = 8;
+    // Entries that are ready, in the order of their turns: those without a block that has a say have no place here. So
+    // the one looked at last keeps its own until it is added up, however many are passed over.
+    constexpr int kReady = 16;
+    static_assert(kReady > kReadyAhead + 1);
+    TileEntry<R> ready[kReady];
+    int readied = 0, taken = 0;
     const Pair* entries = args.pairs + begin;
-    const auto entry_of = [&](int j) -> TileEntry<R>& { return chunk[j % (2 * kAhead)]; };
     const auto record_of = [&](int j) -> const Record<R>& { return args.records[entries[j].id]; };
     const auto sums_of = [&](int j) { return all.sums + size_t(entries[j].place) * kSumStride; };
+
+    const auto make_ready = [&](int j) {
+        if (entries[j].mask & heard) prepare(ready[readied++ % kReady], record_of(j), double(box.left), double(box.top), j);
+    };
+    for (int j = n - 1; j >= 0 && j > n - 1 - kReadyAhead; j--) make_ready(j);
 
     const auto clear = [&](Totals& t) { t.e = t.er = t.es = t.err = t.ers = t.ess = t.red = t.green = t.blue = t.depth = zero; };
     const auto put = [&](const Totals& total, int j) {
@@ -160,24 +170,24 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     Totals total;
     clear(total);
     [[maybe_unused]] Seen seen;
-    int open = -1;  // entry of the block looked at last
+    const TileEntry<R>* latest = nullptr;  // that of the block looked at last
+    int open = -1;                         // and its number
     const auto close = [&] {
-        add(total, entry_of(open), seen);
+        add(total, *latest, seen);
         put(total, open);
     };
     for (int j = n - 1; j >= 0; j--) {
-        if (j == n - 1 || j % kAhead == kAhead - 1)
-            for (int i = j / kAhead * kAhead; i <= j; i++)
-                if (entries[i].mask & heard) prepare(entry_of(i), record_of(i), double(box.left), double(box.top), i);
-        if (j >= kAhead) __builtin_prefetch(&record_of(j - kAhead)), __builtin_prefetch(sums_of(j - kAhead), 1);
+        if (j >= kRecordAhead) __builtin_prefetch(&record_of(j - kRecordAhead));
+        if (j >= kReadyAhead) make_ready(j - kReadyAhead);
+        if (j >= kSumsAhead) __builtin_prefetch(sums_of(j - kSumsAhead), 1);
         uint32_t mask = entries[j].mask & heard;
         all.written[entries[j].place] = mask != 0;
         if (!mask) continue;
-        const TileEntry<R>& entry = entry_of(j);
+        const TileEntry<R>& entry = ready[taken++ % kReady];
         if constexpr (kOverlap) {
             Seen next = look(entry, mask);
             if (open >= 0) close();
-            open = j, seen = next, clear(total);
+            open = j, latest = &entry, seen = next, clear(total);
             while (mask &= mask - 1) {
                 next = look(entry, mask);
                 add(total, entry, seen);
