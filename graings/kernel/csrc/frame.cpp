@@ -66,7 +66,8 @@ std::vector<Piece> Frame<R>::project(const ProjectArgs<R>& args, Binning<R>& bin
         Piece& piece = pieces[size_t(index)];
         piece.begin = index * kPiece, piece.end = std::min(count_, (index + 1) * kPiece), piece.worker = worker;
         kernels<R>().project(args, piece.begin, piece.end);
-        for (int k = 0; k < kStatuses; k++) piece.statuses[size_t(k)] = std::count(status_.get() + piece.begin, status_.get() + piece.end, k);
+        for (int64_t k = 0, left = piece.end - piece.begin; k < kStatuses && left > 0; k++)  // most pieces are drawn whole
+            left -= piece.statuses[size_t(k)] = std::count(status_.get() + piece.begin, status_.get() + piece.end, k);
         binning.count(piece);
     });
     for (const Piece& piece : pieces)
