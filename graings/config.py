@@ -32,6 +32,7 @@ SHAPE_BEFORE: Final[dict[str, Any]] = {
     "time_width": 64,
     "direction_degree": 1,
     "head_width": 32,
+    "reflection": False,
 }
 
 
@@ -64,7 +65,7 @@ class SceneConfig(Part):
     """Shape of the model and the paper's structural ablations. Owner: `graings.scene`."""
 
     children: int = Field(10, ge=1, le=32, description="Child Gaussians per anchor (k).")
-    feature_dim: int = Field(32, ge=1, le=256, description="Length of the anchor feature (d_f).")
+    feature_dim: int = Field(64, ge=1, le=256, description="Length of the anchor feature (d_f).")
     head_width: int = Field(96, ge=4, le=512, description="Hidden width of the colour, opacity and residual heads.")
     static_width: int = Field(64, ge=4, le=512, description="Hidden width of StaticMLP.")
     deform_width: int = Field(128, ge=4, le=1024, description="Hidden width of DeformNet.")
@@ -94,6 +95,11 @@ class SceneConfig(Part):
         le=3,
         description="Degree up to which the colour head sees spherical harmonics of the viewing direction; 1 is the "
         "direction itself.",
+    )
+    reflection: bool = Field(
+        True,
+        description="Let the colour head also see the viewing direction mirrored at a normal that it reads from the "
+        "feature: where a highlight lies.",
     )
     opacity_view: bool = Field(False, description="Feed the viewing direction to the opacity head, as the paper does.")
     projected_clip: bool = Field(True, description="Let clipped values receive gradients that point back inside.")

@@ -13,7 +13,13 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from graings.config import SceneConfig
-from graings.scene.encoding import direction_encoding, direction_width, encoding_width, frequency_encoding
+from graings.scene.encoding import (
+    direction_encoding,
+    direction_width,
+    encoding_width,
+    frequency_encoding,
+    mirrored,
+)
 from graings.scene.perceptron import perceptron, weights_and_biases
 from graings.scene.saturate import sigmoid, tanh
 
@@ -22,8 +28,10 @@ class CanonicalAppearance(nn.Module):
     """F_c and F_o: (f_a, v) -> colour in (0, 1) and opacity score in (-1, 1) per child slot, Eq. 11.
 
     F_c sees v as spherical harmonics up to `direction_degree`: a highlight is narrower than what one hidden layer makes
-    of the direction itself. With `opacity_view` off F_o sees the feature only: in a monocular capture the viewing
-    direction names the frame, and opacity could then switch children per frame instead of moving them (decision 8).
+    of the direction itself. With `reflection` it also sees v mirrored at a normal, a linear function of f_a: all of a
+    curved surface then has its highlight where that direction meets the light. With `opacity_view` off F_o sees the
+    feature only: in a monocular capture the viewing direction names the frame, and opacity could then switch children
+    per frame instead of moving them (decision 8).
     """
 
     def __init__(self, config: SceneConfig, initial_opacity: float) -> None:
@@ -31,10 +39,12 @@ class CanonicalAppearance(nn.Module):
         k, width = config.children, config.head_width
         self.opacity_view = config.opacity_view
         self.direction_degree = config.direction_degree
-        color_inputs = config.feature_dim + direction_width(config.direction_degree)
+        seen = 2 if config.reflection else 1
+        color_inputs = config.feature_dim + seen * direction_width(config.direction_degree)
         self.color = nn.Sequential(nn.Linear(color_inputs, width), nn.ReLU(), nn.Linear(width, 3 * k))
         opacity_inputs = config.feature_dim + (3 if config.opacity_view else 0)
         self.opacity = nn.Sequential(nn.Linear(opacity_inputs, width), nn.ReLU(), nn.Linear(width, k))
+        self.normal = nn.Linear(config.feature_dim, 3) if config.reflection else None
         last = self.opacity[-1]
         assert isinstance(last, nn.Linear)
         with torch.no_grad():
@@ -48,7 +58,12 @@ class CanonicalAppearance(nn.Module):
         children: Int64[Tensor, " drawn"],
     ) -> Float[Tensor, "drawn 3"]:
         """c_can of the given flat child slots (anchor * k + child)."""
-        inputs = torch.cat([features, direction_encoding(directions, self.direction_degree)], dim=-1)
+        seen = [directions]
+        if self.normal is not None:
+            seen.append(mirrored(directions, self.normal(features)))
+        inputs = torch.cat(
+            [features, *(direction_encoding(towards, self.direction_degree) for towards in seen)], dim=-1
+        )
         raw = perceptron(inputs, *weights_and_biases(self.color))
         return sigmoid(raw.view(-1, 3).index_select(0, children))
 

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from graings import kernel
 
+_NORMAL_EPSILON = 1e-6  # added to a normal's squared length: below a thousandth it fades out instead of spinning
+
 
 def encoding_width(dimensions: int, octaves: int) -> int:
     """Length of the encoding of a `dimensions`-vector."""
@@ -40,6 +42,15 @@ def plain_frequency_encoding(x: Float[Tensor, "*batch dim"], octaves: int) -> Fl
     frequencies = 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device)
     phases = (x.unsqueeze(-1) * frequencies).flatten(-2)
     return torch.cat([x, phases.sin(), phases.cos()], dim=-1)
+
+
+def mirrored(directions: Float[Tensor, "*batch 3"], vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Unit vectors mirrored at the planes across `vectors`, which may have any length; at zero nothing is mirrored.
+
+    It is the direction from which a mirror with that normal shows light (Ref-NeRF, Eq. 4, as seen from the camera).
+    """
+    squared = vectors.square().sum(dim=-1, keepdim=True) + _NORMAL_EPSILON
+    return directions - 2 * ((directions * vectors).sum(dim=-1, keepdim=True) / squared) * vectors
 
 
 def direction_width(degree: int) -> int:

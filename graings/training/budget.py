@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 from graings.config import SceneConfig
-from graings.scene.encoding import encoding_width
+from graings.scene.encoding import direction_width, encoding_width
 
 FLOAT: Final = 4
 MEGABYTE: Final = 1_000_000
@@ -35,7 +35,14 @@ def bytes_per_anchor(config: SceneConfig, views: int) -> int:
     fixed = 20 * (1 + COPIES) + statistics * 4
     static = 3 + k + config.static_width
     deform = encoding_width(3, config.position_frequencies) + config.deform_width * config.deform_depth
-    heads = (config.feature_dim + 3) + 3 * config.head_width + 8 * k + config.static_width
+    seen = 2 if config.reflection else 1
+    heads = (
+        config.feature_dim
+        + seen * direction_width(config.direction_degree)
+        + 3 * config.head_width
+        + 8 * k
+        + config.static_width
+    )
     networks = static + deform
     if config.single_mlp or config.deform_time == "input":  # time goes through the hidden layers
         networks *= views

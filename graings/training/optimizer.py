@@ -36,6 +36,7 @@ _GROUPS = {
     "static": "static",
     "single": "deformation",
     "appearance.color": "color",
+    "appearance.normal": "color",
     "appearance.opacity": "opacity",
     "residual": "residual",
     "deformation": "deformation",
