@@ -309,7 +309,7 @@ MUTANTS = (
     ),
     Mutant(
         "ready-places",
-        "an entry made ready in the place of the one that is still open",
+        "an entry made ready in place of the one still open",
         TILE_GRADIENT,
         "    constexpr int kReady = 16;\n    static_assert(kReady > kReadyAhead + 1);\n",
         "    constexpr int kReady = 9;\n",
