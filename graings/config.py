@@ -180,7 +180,7 @@ class RatesConfig(Part):
     opacity_offsets: FirstAndLast = (0.02, 0.002)
     static: FirstAndLast = (0.004, 0.0004)
     color: FirstAndLast = (0.008, 5e-5)
-    opacity: FirstAndLast = (0.002, 2e-5)
+    opacity: FirstAndLast = (0.0007, 7e-6)
     residual: FirstAndLast = (0.002, 2e-5)
     deformation: FirstAndLast = (2e-3, 5e-5)
     matrices: FirstAndLast = (2e-3, 5e-5)
@@ -269,7 +269,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         # Many views of few Gaussians: what moves is found sooner than with few views of many.
         "iterations": 1_000,
         "batch": 4,
-        "density": {"gradient_threshold": 3e-4, "min_observations": 20, "max_anchors": 1_200},
+        # Gradients of the first steps, which find the colour of everything, do not say where detail is missing.
+        "density": {
+            "statistics_from": 2_000,
+            "gradient_threshold": 3e-4,
+            "min_observations": 20,
+            "max_anchors": 1_200,
+        },
         "evaluation": {"checkpoint_every": 250},  # a look at what there is by then, half a minute from the start
         "rates": {"offsets": (0.03, 3e-4), "matrices": (8e-3, 2e-4)},
     },

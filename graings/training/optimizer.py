@@ -121,26 +121,34 @@ class Optimizer:
         """Limit the gradients of `group`: no entry above `times` its own usual size, and all together at most `norm`.
 
         The usual size is the root of Adam's second moment as it is stored, so that `times` = 100 lets the moment grow
-        11-fold and the following steps shrink to 30 %, however young the moment is. An entry without one, also of a
-        matrix that Muon steps, is limited with its group only. A single spike thus neither freezes its own parameter
-        nor takes its group down with it.
+        11-fold and the following steps shrink to 30 %, however young the moment is. For an entry of a matrix that Muon
+        steps it is the root mean square of the matrix's momentum: a single entry that outweighs its matrix would have
+        the steps of all others. An entry with neither is limited with its group only. A single spike thus neither
+        freezes its own parameter nor takes its matrix or its group down with it.
         """
+        momenta = dict(zip(self.muon.parameters, self.muon.momenta, strict=True))
         members = [p for one in self.adam.param_groups if one["name"] == group for p in one["params"]]
         members += [p for p, owner in zip(self.muon.parameters, self._muon_groups, strict=True) if owner == group]
         gradients: list[Tensor] = []
         for parameter in members:
             if parameter.grad is None:
                 continue
-            state = self.adam.state.get(parameter)
-            if state:
-                most = state["exp_avg_sq"].sqrt().mul_(times)
-                most.masked_fill_(most == 0, math.inf)
+            usual = self._usual_size(parameter, momenta.get(parameter))
+            if usual is not None:
+                most = torch.where(usual == 0, math.inf, times * usual)
                 parameter.grad.clamp_(min=-most, max=most)
             gradients.append(parameter.grad)
         left = math.hypot(*(float(torch.linalg.vector_norm(gradient.double())) for gradient in gradients))
         if left > norm:
             # A power of two keeps every bit of the gradient, and the result does not hang on the norm's last one.
             torch._foreach_mul_(gradients, 2.0 ** math.floor(math.log2(norm / left)))
+
+    def _usual_size(self, parameter: nn.Parameter, momentum: Tensor | None) -> Tensor | None:
+        """Of the gradient of each entry of `parameter`, as far as past steps tell."""
+        if momentum is not None:
+            return momentum.square().mean().sqrt()
+        state = self.adam.state.get(parameter)
+        return state["exp_avg_sq"].sqrt() if state else None
 
     def clear(self) -> None:
         """Drop all gradients."""

@@ -204,7 +204,10 @@ def test_a_finite_spike_is_limited_and_does_not_freeze_its_parameter(micro: Path
 
 
 def test_a_finite_spike_does_not_stop_the_rest_of_its_matrix(micro: Path) -> None:
-    """E03 where singular values are made equal: 1e10 in one entry; the next 200 updates of all other entries."""
+    """E03 where singular values are made equal: 1e10 in one entry; the next 200 updates of all other entries.
+
+    E03 asks for a fifth of the usual size; an entry limited by its own matrix leaves them three quarters and more.
+    """
     trainer = micro_trainer(micro, iterations=300)
     name = "deformation.hidden.0.weight"
     spoil_gradient(trainer, name, lambda i: i == 100, lambda gradient: first(gradient, 1e10))
@@ -219,7 +222,7 @@ def test_a_finite_spike_does_not_stop_the_rest_of_its_matrix(micro: Path) -> Non
             assert len(events) == 1
             assert events[0].startswith("clipped: gradients of deformation at 1e+10")
     normal = sum(sizes[60:99]) / 39
-    assert min(sizes[100:]) >= 0.2 * normal
+    assert min(sizes[100:]) >= 0.5 * normal
     assert finite(trainer)
 
 
