@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NoReturn
+from typing import Annotated, Any, Final, Literal, NoReturn, get_args
 
 import typer
 import typer.core
@@ -270,7 +270,9 @@ def _fields(part: Part, prefix: str = "") -> Iterator[tuple[str, str, str, str]]
             yield from _fields(value, f"{prefix}{name}.")
             continue
         signs = (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<"))
-        bounds = [f"{sign} {getattr(m, key)}" for m in field.metadata for key, sign in signs if hasattr(m, key)]
+        items = [info for item in get_args(field.annotation)[:1] for info in getattr(item, "__metadata__", ())]
+        limits = [*field.metadata, *(limit for info in items for limit in info.metadata)]  # its own, or of each item
+        bounds = [f"{sign} {getattr(m, key)}" for m in limits for key, sign in signs if hasattr(m, key)]
         yield f"{prefix}{name}", json.dumps(value), ", ".join(bounds), field.description or ""
 
 

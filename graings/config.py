@@ -159,7 +159,7 @@ class DensityConfig(Part):
     memory_mb: int = Field(
         4096, ge=1, description="Memory in MB that anchors and one training step may take; growth stops where it ends."
     )
-    prune_from: int = Field(24_600, ge=0, description="First pruning: 80 % of the joint phase.")
+    prune_from: int = Field(24_600, ge=0, description="First pruning: about 80 % of the joint phase.")
     prune_until: int = Field(29_000, ge=0, description="Last pruning.")
     prune_every: int = Field(500, ge=1, description="Iterations between prunings.")
     prune_opacity: float = Field(0.005, ge=0, description="Anchors whose summed child opacity stays below are removed.")
@@ -171,19 +171,25 @@ class DensityConfig(Part):
 class RatesConfig(Part):
     """Learning rates, first and last (log-linear between). Owner: `graings.training.optimizer`.
 
-    They are Adam's; `matrices` is that of the matrices in `static` and `deformation` unless `matrix_step` is adam.
+    They are Adam's; `matrices` is that of the matrices in `static` and `deformation` but for their last layers, unless
+    `matrix_step` is adam.
     """
 
-    offsets: FirstAndLast = (0.02, 2e-4)
-    features: FirstAndLast = (0.0075, 0.0015)
-    log_scales: FirstAndLast = (0.007, 0.0014)
-    opacity_offsets: FirstAndLast = (0.02, 0.002)
-    static: FirstAndLast = (0.004, 0.0004)
-    color: FirstAndLast = (0.008, 5e-5)
-    opacity: FirstAndLast = (0.0007, 7e-6)
-    residual: FirstAndLast = (0.002, 2e-5)
-    deformation: FirstAndLast = (2e-3, 5e-5)
-    matrices: FirstAndLast = (2e-3, 5e-5)
+    offsets: FirstAndLast = Field((0.02, 2e-4), description="Child offsets, in units of s_a.")
+    features: FirstAndLast = Field((0.0075, 0.0015), description="Anchor features.")
+    log_scales: FirstAndLast = Field((0.007, 0.0014), description="log s_a of the anchors.")
+    opacity_offsets: FirstAndLast = Field((0.02, 0.002), description="What an anchor adds to its opacity logits.")
+    static: FirstAndLast = Field((0.004, 0.0004), description="StaticMLP.")
+    color: FirstAndLast = Field((0.008, 5e-5), description="Colour head, with the normals of its mirror.")
+    opacity: FirstAndLast = Field(
+        (0.0007, 7e-6),
+        description="Opacity head. At three times as much a scene may fade before its colours fit, and stay so.",
+    )
+    residual: FirstAndLast = Field((0.002, 2e-5), description="Residual field of the appearance.")
+    deformation: FirstAndLast = Field((2e-3, 5e-5), description="DeformNet.")
+    matrices: FirstAndLast = Field(
+        (2e-3, 5e-5), description="Hidden matrices of StaticMLP and DeformNet, where Muon steps them."
+    )
 
 
 class GuardConfig(Part):

@@ -8,15 +8,17 @@ from __future__ import annotations
 import hashlib
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from graings.capture.capture import Capture, Frame
+from numpy.typing import ArrayLike
+
+from graings.capture.capture import Frame, Split
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.compact import open_model
 from graings.errors import CheckpointError
-from graings.metrics import Lpips, SplitMetrics, measure
+from graings.metrics import Lpips, SplitMetrics, measure_split
 from graings.render import render
 from graings.report import read_metrics, write_metrics
 from graings.run_folder import read_record
@@ -33,12 +35,12 @@ def evaluate(
 ) -> SplitMetrics:
     """Metrics of `scene` on `frames`: each view rendered at its own camera and time."""
 
-    views = []
-    for frame in frames:
-        rendered = render(scene, frame.camera, frame.time, background)
-        color = rendered.color.clamp(0, 1).numpy()
-        views.append(measure(frame.name, frame.time, color, images.rgb(frame), lpips))
-    return SplitMetrics.over(views, None if lpips is None else lpips.reason)
+    def pairs() -> Iterator[tuple[str, float, ArrayLike, ArrayLike]]:
+        for frame in frames:
+            rendered = render(scene, frame.camera, frame.time, background)
+            yield frame.name, frame.time, rendered.color.clamp(0, 1).numpy(), images.rgb(frame)
+
+    return measure_split(pairs(), lpips)
 
 
 def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:
@@ -59,7 +61,7 @@ def frames_per_second(scene: Scene, frames: Sequence[Frame], background: Sequenc
     return 1.0 / max(statistics.median(seconds[1:]), 1e-9)
 
 
-def evaluate_run(run: Path, split: str, capture: Path | None = None) -> SplitMetrics:
+def evaluate_run(run: Path, split: Split, capture: Path | None = None) -> SplitMetrics:
     """Evaluate the newest model of a run on one split and write the result into its `metrics.json`.
 
     The capture is found where it was at training time unless given. Raises `CheckpointError` when the run has
@@ -72,7 +74,7 @@ def evaluate_run(run: Path, split: str, capture: Path | None = None) -> SplitMet
         raise CheckpointError(
             f"{data.root}: not the capture this run was trained on. Give the original with --capture."
         )
-    frames = _split(data, split)
+    frames = data.split(split)
     images = ImageStore(model.background, model.config.capture.cache_mb)
     metrics = evaluate(model.scene, frames, images, model.background, lpips=Lpips.find())
     document = read_metrics(run / "metrics.json")
@@ -81,13 +83,3 @@ def evaluate_run(run: Path, split: str, capture: Path | None = None) -> SplitMet
     document["splits"][split] = metrics.to_json()
     write_metrics(run / "metrics.json", document)
     return metrics
-
-
-def _split(capture: Capture, name: str) -> tuple[Frame, ...]:
-    if name == "val":
-        return capture.val
-    if name == "test":
-        return capture.test
-    if name == "train":
-        return capture.train
-    raise ValueError(f"split must be train, val or test, got {name!r}")

@@ -1,6 +1,6 @@
 """Model: a trained scene with what is needed to look at it, and that as JSON facts beside tensors.
 
-Knows nothing of files.
+Knows nothing of how files hold it.
 """
 
 from __future__ import annotations

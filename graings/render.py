@@ -1,6 +1,6 @@
 """render: the one path from a scene to a picture.
 
-Training, evaluation, export and serving all pass here; scene and rasterizer meet nowhere else. Knows
+Training, evaluation and serving all pass here; scene and rasterizer meet nowhere else. Knows
 nothing of images on disk, losses or HTTP.
 """
 

@@ -2,8 +2,8 @@
 
 Reads the `metrics.json` of finished or cut-off runs and says what a reader wants to compare: held-out error against
 seconds, iterations and Gaussians, the time to given decibels, and where the seconds went. What was not reached is null
-with its reason; what does not add up is said, not hidden. Knows nothing of pictures, models or how
-runs are trained.
+with its reason; what does not add up is said, not hidden. Knows nothing of models or how runs are
+trained.
 """
 
 from __future__ import annotations

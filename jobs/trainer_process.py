@@ -82,7 +82,8 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     threads = min(config.threads or threads, threads)
     capture = Store(folder.path.parent.parent).capture(spec.capture)
     checkpoint = folder.checkpoint()
-    attempt = len(folder.attempts())
+    starts = folder.attempts()  # the last ones
+    attempt = starts[-1].number if starts else 1
     progress = ProgressWriter(folder.progress)
     beginning = {"iteration": checkpoint or 0, "iterations": config.iterations, "attempt": attempt}
     progress.write({"phase": "loading", **beginning})

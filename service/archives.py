@@ -1,7 +1,7 @@
 """Archives: unpack a zip or tar that a stranger sent, or refuse it.
 
 Only plain files and folders come out, only below the target, only as much as the limits allow; what an archive says
-about itself is not believed. Knows nothing of captures or HTTP.
+about itself is not believed. Knows nothing of HTTP.
 """
 
 from __future__ import annotations

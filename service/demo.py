@@ -1,7 +1,8 @@
 """The command `demo`: the whole way once, over HTTP, on a small scene that needs no download.
 
 Starts service and worker as `graings serve --with-worker` does, writes the built-in moving capture, sends it, watches
-it train, and fetches views and numbers. A client like any other: it knows the service by its addresses only.
+it train, and fetches views and numbers. A client like any other: it knows the service by its addresses and the names of
+its states.
 """
 
 from __future__ import annotations

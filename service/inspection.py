@@ -1,7 +1,7 @@
 """Inspection: whether training could begin on an unpacked capture.
 
 Files of strangers go through readers of images and of COLMAP models that are not ours. They run in a process beside
-the service, which a crash or a shortage of memory there does not reach. Knows nothing of requests and jobs.
+the service, which a crash or a shortage of memory there does not reach. Knows nothing of requests.
 """
 
 from __future__ import annotations

@@ -91,6 +91,9 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (GraingsError, 500, "graings"),
 )
 
+# What is away for a while may be asked for again after some seconds.
+AWAY = {"Retry-After": "5"}
+
 # What to say where a framework says no more than the status.
 _REMEDIES = {
     404: "There is nothing at this address. /docs lists every address there is.",
@@ -138,6 +141,8 @@ def install(app: FastAPI) -> None:
         if status >= 500 and status != 503:
             LOG.error("%s %s: %s", request.method, request.url.path, error)
         headers = error.headers if isinstance(error, ServiceError) else None
+        if status == 503 and headers is None:
+            headers = AWAY
         return problem(request, status, str(error), kind=kind, headers=headers)
 
     async def http(request: Request, error: Exception) -> Response:

@@ -1,7 +1,7 @@
 """Scenes: loaded models and the pool that draws them.
 
 Models are kept by what their file holds, the least recently used one leaves; images are drawn in a few threads,
-and who finds too many waiting is turned away at once. Knows nothing of HTTP.
+and who finds too many waiting is turned away at once. Knows nothing of requests.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -13,7 +14,7 @@ import pytest
 from graings.capture.synthetic import write_synthetic
 from graings.checkpoint import load_model, newest_checkpoint
 from graings.cli import main
-from graings.config import make_config
+from graings.config import TrainConfig, make_config
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -235,9 +236,19 @@ def test_options_are_listed_with_value_bounds_and_help(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     assert graings("options", "--preset", "draft") == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("density.max_anchors"))
-    assert line.split()[:4] == ["density.max_anchors", "1200", "≥", "16"]
-    assert "Hard budget of anchors" in line
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.strip()}
+    assert lines["density.max_anchors"].split()[:4] == ["density.max_anchors", "1200", "≥", "16"]
+    assert "Hard budget of anchors" in lines["density.max_anchors"]
+    assert lines["rates.deformation"].split() == ["rates.deformation", "[0.002,", "5e-05]", "≥", "0", "DeformNet."]
+
+
+def test_every_option_says_what_it_is() -> None:
+    def silent(schema: dict[str, Any]) -> list[str]:
+        parts = {"TrainConfig": schema, **schema["$defs"]}
+        fields = [(f"{part}.{name}", one) for part, facts in parts.items() for name, one in facts["properties"].items()]
+        return [name for name, one in fields if "description" not in one and "$ref" not in one]
+
+    assert silent(TrainConfig.model_json_schema()) == []
 
 
 def test_options_as_json_are_the_schema(capsys: pytest.CaptureFixture[str]) -> None:

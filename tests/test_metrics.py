@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.capture.synthetic import write_synthetic
+from graings.config import CaptureConfig
+from graings.evaluation import evaluate
 from graings.metrics import VGG_FILE, Lpips, SplitMetrics, _backbone_problem, measure, measure_split, psnr, ssim_3dgs
+from tests.models import tiny_scene
 
 
 def noise(seed: int, height: int, width: int) -> np.ndarray:
@@ -148,3 +154,10 @@ def test_images_too_small_for_the_network_have_no_perceptual_distance() -> None:
     assert split.lpips_vgg is None
     assert "under 32 pixels" in str(split.lpips_reason)
     assert SplitMetrics.over((large,), lpips.reason).lpips_vgg == large.lpips_vgg
+
+
+def test_without_a_distance_the_reason_is_that_none_was_asked_for(tmp_path: Path) -> None:
+    capture = load_capture(write_synthetic(tmp_path / "c", frames=4, size=40), CaptureConfig())
+    images = ImageStore((1.0, 1.0, 1.0), 64)
+    found = evaluate(tiny_scene(anchors=4), capture.train[:1], images, (1.0, 1.0, 1.0))
+    assert (found.lpips_vgg, found.lpips_reason) == (None, "LPIPS was not asked for")

@@ -2,7 +2,7 @@
 
 Every Gaussian is evaluated at every pixel, in float64, and autograd takes the derivative. It is slow and
 obviously right; the kernel must agree with it. Culling, order and stopping are those of the kernel because
-both follow the same rules, not because they share code. Knows nothing of tiles, threads or instruction sets.
+both follow the same rules, not because they share code. Knows nothing of threads or instruction sets.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """DeformationNetwork: an offset in time for each Gaussian (Eq. 7).
 
-Knows nothing of anchors, appearance, cameras or pixels. Whether its positions are detached is the scene's
+Knows nothing of appearance, cameras or pixels. Whether its positions are detached is the scene's
 decision, not this module's.
 """
 

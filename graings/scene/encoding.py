@@ -25,8 +25,8 @@ def encoding_width(dimensions: int, octaves: int) -> int:
 def frequency_encoding(x: Float[Tensor, "*batch dim"], octaves: int) -> Float[Tensor, "*batch width"]:
     """(x, sin 2^0 x, ..., sin 2^(L-1) x, cos 2^0 x, ..., cos 2^(L-1) x) with L = `octaves`.
 
-    The raw value comes along and the frequencies carry no factor pi (decision 13), so that over [0, 1] every
-    octave but the last few is monotone and t = 0 and t = 1 never alias. Differentiable where `x` wants a gradient.
+    The raw value comes along and the frequencies carry no factor pi (decision 13), so that over [0, 1] the
+    lowest octave is monotone and t = 0 and t = 1 never alias. Differentiable where `x` wants a gradient.
     """
     if octaves == 0:
         return x

@@ -43,7 +43,7 @@ class DensityStatistics:
     """What was observed since the last reset; float64 sums and int64 counts.
 
     `gradient` and `drawn` [A, k]: sum of NDC gradient norms and times drawn, per child. `opacity` and `visits`
-    [A]: sum over visits of the summed positive child scores, and times the anchor was in view.
+    [A]: sum over visits of the summed positive child scores, and times the anchor was in view or too faint to be drawn.
     """
 
     NAMES = ("gradient", "drawn", "opacity", "visits")

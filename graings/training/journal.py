@@ -1,7 +1,7 @@
 """Journal: what a run says of itself — its curve, events and seconds, and the documents made of them.
 
-Writes run.json, metrics.json, curve.svg and report/ in the run's folder. Knows nothing of how a scene is trained,
-evaluated or stored.
+Writes run.json, metrics.json, curve.svg and report/ in the run's folder. Knows nothing of how a scene is trained
+or stored.
 """
 
 from __future__ import annotations

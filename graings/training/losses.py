@@ -26,7 +26,7 @@ def temporal(
 ) -> Tensor:
     """Mean squared change of the position offset between two neighbouring times, Eq. 16.
 
-    `gap` is the time between them and `mean_gap` the capture's mean: an irregular pair counts by its speed.
+    `gap` is the time between them and `mean_gap` the capture's mean: an irregular pair is divided by its gap.
     """
     return mean_square(now - neighbour) * (mean_gap / gap)
 

@@ -200,7 +200,7 @@ class Optimizer:
             parameter = parameters[name]
             if parameter not in places:
                 self.adam.state[parameter][field] = value.clone()
-            elif field == MOMENTUM_OF:  # checkpoints of 0.1.0 hold Adam's moments here: their momentum begins anew
+            elif field == MOMENTUM_OF:  # older checkpoints hold Adam's moments here: their momentum begins anew
                 self.muon.momenta[places[parameter]] = value.clone()
 
 

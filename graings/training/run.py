@@ -71,7 +71,7 @@ class TrainingRun:
 
     @classmethod
     def create(cls, capture: Path, folder: Path, config: TrainConfig) -> TrainingRun:
-        """Start a run of `config` on the capture at `capture`; `folder` must be new or empty.
+        """Start a run of `config` on the capture at `capture`; `folder` must not hold a run.
 
         Raises `CaptureError` for the capture and `CheckpointError` for the folder.
         """

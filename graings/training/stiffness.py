@@ -1,8 +1,7 @@
 """Stiffness: whether the optimiser's steps fit the sizes of what they move, and how much is too small for any view.
 
 Steps longer than the Gaussians they move shake a scene instead of shaping it, and the scales of a Gaussian far smaller
-than a pixel get next to no gradient: the low-pass of the footprint hides them. Knows nothing of schedules, rates or
-losses.
+than a pixel get next to no gradient: the low-pass of the footprint hides them. Knows nothing of schedules or losses.
 """
 
 from __future__ import annotations

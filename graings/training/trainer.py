@@ -364,7 +364,7 @@ class Trainer:
         self.optimizer.load(parts["adam"])
         self.density.load(parts["statistics"], facts)
         self.streams.load(parts["streams"])
-        if "guard" in facts:  # checkpoints of 0.1.0 have none: their guard begins with them
+        if "guard" in facts:  # older checkpoints have none: their guard begins with them
             self.guard.load(parts["guard"], facts["guard"])
             self.collapse.load(facts["collapse"])
         if "average" in facts:  # older ones did not average either

@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse, Response
 
 from graings.config import options
 from service.context import Here
-from service.problems import RESPONSES, problem
+from service.problems import AWAY, RESPONSES, problem
 from service.schemas import Readiness
 
 WEB = Path(__file__).resolve().parent.parent / "web"
@@ -47,7 +47,9 @@ def readiness(request: Request, here: Here) -> Readiness | Response:
     found = Readiness(ready=True, workers=here.leases.alive(), waiting=here.jobs.waiting(), free_mb=here.free_mb())
     if found.free_mb < here.settings.min_free_mb:
         least = here.settings.min_free_mb
-        return problem(request, 503, f"{found.free_mb} MB free, at least {least} MB are needed.", kind="disk-full")
+        return problem(
+            request, 503, f"{found.free_mb} MB free, at least {least} MB are needed.", kind="disk-full", headers=AWAY
+        )
     return found
 
 

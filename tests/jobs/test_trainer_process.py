@@ -14,7 +14,7 @@ from graings.config import make_config
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
 from jobs.progress import last_progress, read_progress
-from jobs.store import JobFolder, Store
+from jobs.store import KEPT_ATTEMPTS, JobFolder, Store
 from jobs.trainer_process import _report
 
 
@@ -45,8 +45,12 @@ def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_p
 
 def test_a_finished_job_has_its_report(tmp_path: Path) -> None:
     folder = job(Store(tmp_path), {"iterations": 12})
+    for _ in range(KEPT_ATTEMPTS + 2):  # of which the store forgets the first two
+        folder.begin_attempt("worker")
     with trainer(folder) as process:
         assert process.wait(60) == ExitCode.DONE
+    told, _ = read_progress(folder.progress, 0)
+    assert next(facts["attempt"] for _, facts in told if "attempt" in facts) == KEPT_ATTEMPTS + 2
     document = json.loads((folder.report / "work_precision.json").read_text())
     assert document["training"][0]["run"]["name"] == folder.path.name
     assert len(document["render"][0]["points"]) > 1

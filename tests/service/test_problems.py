@@ -48,8 +48,9 @@ def test_every_error_has_its_status_and_says_itself(error: Exception, status: in
         assert document["detail"] == str(error)
 
 
-def test_the_busy_say_when_to_come_back() -> None:
-    assert raising(Busy("later")).get("/").headers["retry-after"] == "1"
+@pytest.mark.parametrize(("error", "seconds"), [(Busy("later"), "1"), (JobError("away"), "5")])
+def test_what_is_not_to_be_had_now_says_when_to_come_back(error: Exception, seconds: str) -> None:
+    assert raising(error).get("/").headers["retry-after"] == seconds
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("secret"), PermissionError("secret"), ValueError(math.nan)])

@@ -33,7 +33,9 @@ def test_health_and_readiness(client: TestClient, job: str, settings: Settings) 
 
 def test_a_full_disk_is_not_ready(settings: Settings) -> None:
     with TestClient(create_app(settings.model_copy(update={"min_free_mb": 10**9}))) as client:
-        assert "free" in problem(client.get("/readyz"), 503)["detail"]
+        answer = client.get("/readyz")
+        assert "free" in problem(answer, 503)["detail"]
+        assert answer.headers["retry-after"] == "5"
 
 
 def test_the_page_needs_nothing_from_anywhere_else(client: TestClient) -> None:

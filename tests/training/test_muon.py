@@ -56,6 +56,17 @@ def test_a_rare_direction_moves_as_far_as_a_common_one() -> None:
     assert float(along.max()) < 1.25
 
 
+def test_a_rare_direction_among_as_many_as_the_largest_layer_has_moves_two_fifths_as_far() -> None:
+    left, right = (
+        torch.linalg.qr(torch.randn(128, 128, generator=torch.Generator().manual_seed(i)))[0] for i in (0, 1)
+    )
+    values = torch.ones(128)
+    values[-1] = 0.011
+    along = (left.mT @ orthogonal(left @ torch.diag(values) @ right.mT) @ right).diagonal()
+    assert float(along.min()) > 0.4
+    assert float(along.max()) < 1.25
+
+
 def test_nothing_stays_nothing() -> None:
     parameter = nn.Parameter(torch.ones(4, 3))
     muon = Muon([parameter])
