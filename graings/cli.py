@@ -39,6 +39,7 @@ from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camer
 from graings.work_precision import summary
 
 MISSING: Final = 69
+LONGEST_SIDE: Final = 16384  # of a picture, in pixels
 EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (
     (ConfigError, 2),
     (CaptureError, 65),
@@ -107,8 +108,8 @@ def render_view(
     pose: Annotated[
         Path | None, typer.Option(help="JSON: world_to_camera (4x4, OpenCV axes), fx, fy, cx, cy, width, height.")
     ] = None,
-    width: Annotated[int | None, typer.Option(min=1, max=16384, help="Pixels.")] = None,
-    height: Annotated[int | None, typer.Option(min=1, max=16384, help="Pixels.")] = None,
+    width: Annotated[int | None, typer.Option(min=1, max=LONGEST_SIDE, help="Pixels.")] = None,
+    height: Annotated[int | None, typer.Option(min=1, max=LONGEST_SIDE, help="Pixels.")] = None,
     background: Annotated[
         str | None, typer.Option(help="white, black, #rrggbb or r,g,b; left out: as trained.")
     ] = None,
@@ -250,15 +251,18 @@ def _read_pose(file: Path, model: Model) -> Camera:
     """The camera in a pose file; `ValueError` naming the key that is missing or wrong."""
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not JSON ({error})") from error
     keys = ("world_to_camera", "fx", "fy", "cx", "cy", "width", "height")
     absent = [key for key in keys if key not in document] if isinstance(document, dict) else list(keys)
     if absent:
         raise ValueError(f"{file}: {', '.join(absent)} missing; a pose needs {', '.join(keys)}")
+    for key in ("width", "height"):
+        if type(document[key]) is not int or not 1 <= document[key] <= LONGEST_SIDE:
+            raise ValueError(f"{file}: {key} must be a whole number from 1 to {LONGEST_SIDE}, got {document[key]!r}")
     try:
         return pose_camera(model.units, *(document[key] for key in keys))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"{file}: {error}") from error
 
 

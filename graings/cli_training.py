@@ -164,7 +164,7 @@ def _setting(text: str) -> tuple[str, Any]:
         raise typer.BadParameter(f"must look like key=value, got {text!r}", param_hint="--set")
     try:
         return key, json.loads(value)
-    except ValueError:
+    except (ValueError, RecursionError):
         return key, value
 
 

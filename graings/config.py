@@ -355,7 +355,8 @@ def _merge(into: dict[str, Any], values: dict[str, Any], depth: int = 0) -> None
         if isinstance(value, dict):
             child = into.setdefault(head, {})
             if not isinstance(child, dict):
-                raise ConfigError(f"{head}: is a value, it has no part {next(iter(value))!r}.")
+                part = "no parts" if not value else f"no part {next(iter(value))!r}"
+                raise ConfigError(f"{head}: is a value, it has {part}. `graings options` lists every field.")
             _merge(child, value, depth + 1)
         else:
             into[head] = value

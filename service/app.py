@@ -15,6 +15,7 @@ from service import problems
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
 from service.routes import jobs, render, results, system
+from service.same_origin import SameOrigin
 from service.settings import Settings
 
 _SMALL_BODY = 64 * 1024
@@ -42,6 +43,7 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=lifespan,
     )
     app.add_middleware(BodyLimit, limit=limit)
+    app.add_middleware(SameOrigin)
     problems.install(app)
     for routes in (jobs, results, render, system):
         app.include_router(routes.router)

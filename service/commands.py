@@ -33,7 +33,7 @@ def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on (GRAINGS_HOST, 127.0.0.1).")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on (GRAINGS_PORT, 8000).")] = None,
     with_worker: Annotated[bool, typer.Option("--with-worker", help="Start a worker beside the service.")] = False,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads of that worker's job (all).")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads of that worker's job (all).")] = None,
     exit_with_parent: Annotated[bool, typer.Option("--exit-with-parent", help="End when standard input ends.")] = False,
 ) -> None:
     """Serve the REST interface and its page until interrupted."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import signal
 import socket
 import subprocess
@@ -104,7 +105,9 @@ def _train(api: Api, folder: Path, console: Console) -> str:
     """Send the capture and watch the job to its end; returns its id."""
     capture = folder / "capture"
     if not capture.exists():
-        write_synthetic(capture, **CAPTURE)
+        begun = folder / "capture.part"  # so that one cut short is not taken for whole
+        shutil.rmtree(begun, ignore_errors=True)
+        write_synthetic(begun, **CAPTURE).rename(capture)
     console.print(f"Capture: {capture} ({CAPTURE['frames']} frames of {CAPTURE['size']} px)")
     query = urlencode({"preset": PRESET, "name": "synthetic scene", "config": json.dumps(OPTIONS)})
     job = api.json(f"/jobs?{query}", _zipped(capture), "application/zip")

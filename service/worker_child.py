@@ -6,6 +6,7 @@ Started again when it dies, brought to an end with us. Knows nothing of what it 
 from __future__ import annotations
 
 import logging
+import os
 import subprocess
 import sys
 import threading
@@ -18,13 +19,17 @@ LOG = logging.getLogger(__name__)
 
 RESTART_AFTER_S = 2.0
 
+USAGE = 2  # exit code of a command that was given what it does not take
+
 
 class WorkerChild:
     """A context in which a worker runs."""
 
     def __init__(self, settings: Settings, threads: int | None) -> None:
         self._command = [sys.executable, "-m", "jobs.commands", "--exit-with-parent"]
-        self._command += ["--data", str(settings.data), "--database", settings.database_url]
+        self._command += ["--data", str(settings.data)]
+        # Not as an argument: those of a process are everybody's to read, and a password may be in it.
+        self._environment = {**os.environ, "GRAINGS_DATABASE": settings.database_url}
         if threads is not None:
             self._command += ["--threads", str(threads)]
         self._leave = threading.Event()
@@ -35,15 +40,20 @@ class WorkerChild:
     def _start(self) -> subprocess.Popen[bytes]:
         # It ends when its standard input does, so also when we are killed; its own session keeps a Ctrl-C in the
         # terminal ours to pass on.
-        return subprocess.Popen(self._command, stdin=subprocess.PIPE, start_new_session=True)
+        return subprocess.Popen(self._command, stdin=subprocess.PIPE, start_new_session=True, env=self._environment)
 
     def _keep(self) -> None:
         while True:
             code = self._process.wait()
+            assert self._process.stdin is not None
+            self._process.stdin.close()
             if self._leave.wait(RESTART_AFTER_S):
                 return
             with self._guard:
                 if self._leave.is_set():
+                    return
+                if code == USAGE:
+                    LOG.error("the worker refuses how it was started; jobs wait until the service is started otherwise")
                     return
                 LOG.error("the worker ended with code %d and is started again", code)
                 self._process = self._start()

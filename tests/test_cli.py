@@ -167,6 +167,40 @@ def test_a_pose_file_without_a_key_is_refused_by_its_name(
     assert "fy, cx, cy, width, height missing" in " ".join(capsys.readouterr().err.replace("│", " ").split())
 
 
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"width": 1_000_000}, "width must be a whole number from 1 to 16384"),
+        ({"height": 24.5}, "height must be"),
+        ({"width": True}, "width must be"),
+        ({"width": "24"}, "width must be"),
+        ({"fx": 10**400}, "too large"),
+        ({"world_to_camera": [[10**400, 0, 0, 0]] * 4}, "too large"),
+    ],
+)
+def test_a_pose_file_with_a_wrong_number_is_refused_in_one_sentence(
+    run: Path, tmp_path: Path, change: dict[str, object], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    facts = {
+        "world_to_camera": np.eye(4).tolist(),
+        "fx": 50.0,
+        "fy": 50.0,
+        "cx": 12,
+        "cy": 12,
+        "width": 24,
+        "height": 24,
+    }
+    (tmp_path / "pose.json").write_text(json.dumps(facts | change))
+    assert graings("render", run, "--pose", tmp_path / "pose.json", "-o", tmp_path / "view.png") == 2
+    assert word in " ".join(capsys.readouterr().err.replace("│", " ").split())
+
+
+def test_a_pose_file_without_end_is_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "pose.json").write_text("[" * 100_000)
+    assert graings("render", run, "--pose", tmp_path / "pose.json", "-o", tmp_path / "view.png") == 2
+    assert "not JSON" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+
+
 def test_a_missing_pose_file_is_an_input_error(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("render", run, "--pose", tmp_path / "none.json", "-o", tmp_path / "view.png") == 74
     assert "none.json: No such file or directory. Check the path." in " ".join(capsys.readouterr().err.split())

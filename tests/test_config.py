@@ -47,3 +47,10 @@ def test_every_option_is_less_deep_than_that() -> None:
         return 1 + max(map(depth, value.values()), default=0) if isinstance(value, dict) else 0
 
     assert depth(make_config().model_dump()) < DEEPEST
+
+
+def test_a_value_has_no_parts_not_even_none() -> None:
+    with pytest.raises(ConfigError, match="iterations: is a value, it has no parts"):
+        make_config("draft", {"iterations": {}})
+    with pytest.raises(ConfigError, match="iterations: is a value, it has no part 'a'"):
+        make_config("draft", {"iterations.a": 1})

@@ -171,15 +171,12 @@ def _camera(
         fy = fx if angle_y is None else 0.5 * image.height / math.tan(0.5 * angle_y)
     cx = entry.cx if entry.cx is not None else content.cx
     cy = entry.cy if entry.cy is not None else content.cy
-    return Camera(
-        pose,
-        fx,
-        fy,
-        0.5 * image.width if cx is None else cx * sx,
-        0.5 * image.height if cy is None else cy * sy,
-        image.width,
-        image.height,
-    )
+    cx = 0.5 * image.width if cx is None else cx * sx
+    cy = 0.5 * image.height if cy is None else cy * sy
+    try:
+        return Camera(pose, fx, fy, cx, cy, image.width, image.height)
+    except ValueError as error:  # such as a product beyond all numbers
+        raise CaptureError(str(error), file=file, field=where, remedy="Mend the camera there.") from error
 
 
 def _scale(entry: Entry, content: Transforms, image: ImageFile, file: str, where: str) -> tuple[float, float]:

@@ -202,7 +202,7 @@ def _posed(model: Model, query: RenderQuery) -> Camera:
         raise ValueError("a pose needs pose, fx, width and height")
     try:
         matrix = np.array(json.loads(query.pose), dtype=np.float64)
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f"pose must be a JSON list of four rows of four numbers ({error})") from error
     width, height = query.width, query.height
     cx = width / 2 if query.cx is None else query.cx

@@ -146,6 +146,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "pose is singular": (matrix(flatten), rf"{TRAIN}, frames\[2\]\.transform_matrix: the rotation part is singular"),
     "pose with a wrong last row": (matrix(wreck_last_row), rf"{TRAIN}, frames\[2\]\.transform_matrix: the last row"),
     "negative focal length": (frame(fl_x=-20.0), rf"{TRAIN}, frames\[2\]\.fl_x: .*greater than 0"),
+    "an angle below the least": (frame(camera_angle_x=1e-320), rf"{TRAIN}, frames\[2\]: intrinsics must be finite"),
     "an angle of almost nothing": (frame(camera_angle_x=1e-300), r"train/r_002.png, focal length fx: .* sizes"),
     "a lens wider than any": (frame(fl_x=1e-9), r"train/r_002.png, focal length fx: .* sizes"),
     "a centre far away": (frame(cx=1e308), r"train/r_002.png, principal point cx: is .* picture sizes"),

@@ -16,6 +16,9 @@ from typing import Any
 
 import pytest
 
+from service.settings import Settings
+from service.worker_child import WorkerChild
+
 LONG_S = 60.0
 
 
@@ -32,6 +35,7 @@ def test_an_interrupted_service_takes_its_worker_along(tmp_path: Path, number: s
             (lease,) = (tmp_path / "workers").iterdir()
             worker = int(lease.stem.split("-")[-2])
             os.kill(worker, 0)  # it lives
+            assert b"sqlite" not in Path(f"/proc/{worker}/cmdline").read_bytes()  # a password may stand in there
             process.send_signal(number)
             assert process.wait(LONG_S) == 0
             with pytest.raises(ProcessLookupError):
@@ -42,7 +46,7 @@ def test_an_interrupted_service_takes_its_worker_along(tmp_path: Path, number: s
 
 @pytest.mark.parametrize(
     ("options", "word"),
-    [(["--data", f"{__file__}/below"], "below"), (["--database", "foo://bar"], "foo://bar")],
+    [(["--data", f"{__file__}/below"], "below"), (["--database", "foo://bar"], "foo")],
 )
 def test_a_service_that_cannot_open_its_data_says_so_in_one_line(tmp_path: Path, options: list[str], word: str) -> None:
     command = [sys.executable, "-m", "service.commands", "--port", "0", "--data", str(tmp_path), *options]
@@ -51,6 +55,15 @@ def test_a_service_that_cannot_open_its_data_says_so_in_one_line(tmp_path: Path,
     (line,) = ended.stderr.splitlines()
     assert word in line
     assert "--data" in line
+
+
+def test_a_worker_that_refuses_its_arguments_is_not_started_again_and_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with WorkerChild(Settings(data=tmp_path), threads=1_000) as child:
+        child._keeper.join(LONG_S)
+        assert not child._keeper.is_alive()
+    assert caplog.text.count("refuses") == 1
 
 
 def readiness(port: int) -> dict[str, Any]:

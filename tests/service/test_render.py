@@ -162,6 +162,7 @@ POSE = json.dumps(np.eye(4).tolist())
         ({"pose": "[[NaN", "fx": "9", "width": "9", "height": "9"}, "pose"),
         ({"pose": POSE.replace("1.0", "NaN"), "fx": "9", "width": "9", "height": "9"}, "finite"),
         ({"pose": POSE.replace("1.0", "2.0", 1), "fx": "9", "width": "9", "height": "9"}, "rigid"),
+        ({"pose": POSE.replace("1.0", "1" + 400 * "0", 1), "fx": "9", "width": "9", "height": "9"}, "pose"),
         ({"pose": "[" * 3_900, "fx": "9", "width": "9", "height": "9"}, "pose"),
         ({"azimut": "30"}, "azimut"),
     ],
