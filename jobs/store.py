@@ -11,6 +11,8 @@ Every file appears whole or not at all. The store knows nothing of queues: wheth
 from __future__ import annotations
 
 import json
+import logging
+import os
 import shutil
 import time
 import uuid
@@ -20,11 +22,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from graings.run_folder import MODEL_FILE, newest_checkpoint
-from jobs.files import locked, write_json
+from jobs.files import locked, sync_folder, write_json
 from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
 
+LOG = logging.getLogger(__name__)
+
 KEPT_ATTEMPTS = 50
-LEFTOVER_S = 86_400.0
+# An upload to which nothing was written for so long has nobody who works on it.
+LEFTOVER_S = 3_600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,12 +149,14 @@ class Store:
                 if capture.exists():
                     capture.rename(self.uploads / f"{job_id}.replaced")
                 unpacked.rename(capture)
+                sync_folder(self._captures)
                 shutil.rmtree(self.uploads / f"{job_id}.replaced", ignore_errors=True)
             # The record is written first and the folder renamed last: a folder in jobs/ always has its record.
             part = self.uploads / f"{job_id}.job"
             part.mkdir()
             write_json(part / "job.json", {"id": job_id, "created_at": now, "spec": asdict(spec)})
             part.rename(self._jobs / job_id)
+            sync_folder(self._jobs)
         return job_id
 
     def folder(self, job_id: str) -> JobFolder:
@@ -171,6 +178,7 @@ class Store:
             if not free:
                 raise JobConflict(f"Job {job_id} is still writing its checkpoint. Try again in a few seconds.")
             bin_ = self.uploads / f"{job_id}.deleted"
+            os.utime(folder.path)  # so that nobody else takes it for a leftover meanwhile
             folder.path.rename(bin_)
             shutil.rmtree(bin_)
             try:
@@ -181,24 +189,40 @@ class Store:
                 if capture.name not in used:
                     shutil.rmtree(capture, ignore_errors=True)
 
-    def discard_leftovers(self) -> None:
-        """Remove what processes that died left in uploads/. What is younger may still be on its way."""
-        for one in self.uploads.iterdir():
-            try:
-                if time.time() - one.lstat().st_mtime < LEFTOVER_S:
-                    continue
-                if one.is_dir():
-                    shutil.rmtree(one)
-                else:
-                    one.unlink()
-            except FileNotFoundError:
-                continue  # another process was faster
-
     @contextmanager
     def _changing(self) -> Iterator[None]:
         """One at a time adds or removes jobs and captures, whichever process it is in."""
         with locked(self.root / "store.lock"):
             yield
+
+
+def discard_leftovers(uploads: Path) -> None:
+    """Remove what processes that died left in `uploads`; other processes may be at work on the rest.
+
+    What cannot be removed is logged and stays: it is no reason to refuse an upload.
+    """
+    # An archive is only read while it is unpacked beside: paths of one upload have one name and live as long.
+    groups: dict[str, list[Path]] = {}
+    for one in uploads.iterdir():
+        groups.setdefault(one.name.partition(".")[0], []).append(one)
+    for paths in groups.values():
+        try:
+            if time.time() - max(_last_write(one) for one in paths) < LEFTOVER_S:
+                continue
+            for one in paths:
+                if one.is_dir():
+                    shutil.rmtree(one)
+                else:
+                    one.unlink()
+        except FileNotFoundError:
+            continue  # another process was faster
+        except OSError as error:
+            LOG.warning("What an upload left cannot be removed: %s", error)
+
+
+def _last_write(path: Path) -> float:
+    """Unix seconds of the last change to the file, or to anything in the folder. Raises `FileNotFoundError`."""
+    return max(one.lstat().st_mtime for one in (path, *path.rglob("*")))
 
 
 def capture_root(folder: Path) -> Path:

@@ -29,6 +29,19 @@ SUFFIXES = frozenset((*_DATA, *_IMAGES))
 _CHUNK = 1 << 20
 _MAX_DEPTH = 16
 _MAX_NAME = 255
+# Bytes of a whole path. Linux takes 4096, and the folder of the store comes before it.
+_MAX_PATH = 2_048
+# Bytes that a tar may put before one entry, global headers included, to say more of it than fits its own header: a path
+# takes 4 KB at most, the rest is for times and attributes.
+_MAX_HEADERS = 64 << 10
+_HEADERS = (
+    *(tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK),
+    *(tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE),
+)
+# Bytes that the directory of a zip may take: a share for each entry that is allowed, which is ten times what one needs,
+# and a rest in which a few entries have room with names and comments as long as the format lets them be (196 KB).
+_DIRECTORY_PER_ENTRY = 1 << 10
+_DIRECTORY_REST = 1 << 20
 _RATIO_FROM = 16 << 20  # below this much, any ratio is harmless
 _BROKEN = (
     zipfile.BadZipFile,
@@ -98,13 +111,7 @@ def _unpack(archive: Path, folder: Path, limits: Limits) -> Unpacked:
             skipped += 1
             continue
         files += 1
-        target = folder.joinpath(*path.parts)
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
-        except (FileExistsError, NotADirectoryError) as error:
-            raise ArchiveError(f"{entry.name!r} is both a file and a folder. Pack the capture again.") from error
-        with os.fdopen(handle, "wb") as out:
+        with _created(folder.joinpath(*path.parts), entry.name) as out:
             while chunk := entry.stream.read(_CHUNK):
                 total += len(chunk)
                 if total > limits.bytes:
@@ -119,6 +126,21 @@ def _unpack(archive: Path, folder: Path, limits: Limits) -> Unpacked:
     return Unpacked(files, total, skipped)
 
 
+def _created(target: Path, name: str) -> IO[bytes]:
+    """The new file `target`, open for writing, its folders made. Raises `ArchiveError` about the entry `name`."""
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ArchiveError(f"{name!r} is both a file and a folder. Pack the capture again.") from error
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        # Some file systems take less than Linux does, and the folder of the store may lie deep itself.
+        raise ArchiveError(f"{name[:80]!r}… is too long for the disk of the service. Use shorter names.") from error
+    return os.fdopen(handle, "wb")
+
+
 def _entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
     with archive.open("rb") as file:
         head = file.read(512)
@@ -131,6 +153,8 @@ def _entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
 
 
 def _zip_entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
+    with archive.open("rb") as file:
+        _check_directory(file, limits)
     with zipfile.ZipFile(archive) as source:
         _check_count(len(source.infolist()), limits)
         for info in source.infolist():
@@ -146,11 +170,36 @@ def _zip_entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
                     yield _Entry(info.filename, stream)
 
 
+def _check_directory(file: IO[bytes], limits: Limits) -> None:
+    """Refuse a zip with too many entries before zipfile reads its directory whole and makes an object of each."""
+    end = zipfile._EndRecData(file)  # type: ignore[attr-defined]  # what zipfile itself goes by
+    if end is None:
+        return  # zipfile says what is wrong
+    wide, declared, size, place = end[0] == zipfile.stringEndArchive64, end[4], end[5], end[9]  # type: ignore[attr-defined]
+    _check_count(declared, limits)
+    most = limits.files * _DIRECTORY_PER_ENTRY + _DIRECTORY_REST
+    if size > most:
+        raise ArchiveError(
+            f"The archive's list of entries is damaged or takes more than {most} bytes. "
+            "Use shorter names and no comments, or pack the capture again."
+        )
+    # The declared number may be a lie that zipfile does not look at: count the records themselves.
+    start = place - size
+    if wide:
+        start -= zipfile.sizeEndCentDir64 + zipfile.sizeEndCentDir64Locator  # type: ignore[attr-defined]
+    file.seek(max(0, start))
+    _check_count(file.read(size).count(zipfile.stringCentralDir), limits)  # type: ignore[attr-defined]
+
+
 def _tar_entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
-    with tarfile.open(archive, "r:*") as source:
+    with tarfile.open(archive, "r:*", tarinfo=_bounded_headers()) as source:
         declared = 0
-        for number, member in enumerate(source, start=1):
+        for number, member in enumerate(iter(source.next, None), start=1):
+            # tarfile would keep every entry with all that its headers say of it.
+            source.members.clear()  # type: ignore[attr-defined]
             _check_count(number, limits)
+            if member.size < 0:
+                raise ArchiveError(_NEGATIVE)  # it would lead backwards
             # Also of what is left out: passing over it means unpacking it.
             declared += member.size
             if declared > limits.bytes:
@@ -163,6 +212,48 @@ def _tar_entries(archive: Path, limits: Limits) -> Iterator[_Entry]:
                 yield _Entry(member.name, stream)
 
 
+def _bounded_headers() -> type[tarfile.TarInfo]:
+    """A class of headers for one archive that raises `ArchiveError` where tarfile would read too much into memory.
+
+    Long names, pax headers and maps of sparse files are read whole, in any number, before an entry comes out.
+    """
+    ahead = lasting = 0  # bytes of headers since the last entry, and of global ones, which stay
+
+    class Header(tarfile.TarInfo):
+        def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
+            """What tarfile lets a subclass override: called with every header, before what follows it is read."""
+            nonlocal ahead, lasting
+            if self.type == tarfile.GNUTYPE_SPARSE:
+                raise ArchiveError(_sparse(self.name))
+            if self.type not in _HEADERS:
+                ahead = 0
+            elif self.size < 0:
+                raise ArchiveError(_NEGATIVE)  # which reads everything to the end
+            elif self.type == tarfile.XGLTYPE:
+                lasting += self.size
+            else:
+                ahead += self.size
+            if ahead + lasting > _MAX_HEADERS:
+                raise ArchiveError(
+                    f"The archive has headers of more than {_MAX_HEADERS} bytes before one entry. "
+                    "Pack the capture without extended attributes."
+                )
+            return super()._proc_member(archive)  # type: ignore[misc]
+
+        def _proc_gnusparse_10(self, following: tarfile.TarInfo, *_: object) -> None:
+            """Where tarfile would read the map of a sparse file that a pax header speaks of."""
+            raise ArchiveError(_sparse(following.name))
+
+    return Header
+
+
+_NEGATIVE = "The archive is damaged: an entry has a negative size. Pack the capture again."
+
+
+def _sparse(name: str) -> str:
+    return f"{name!r} is a sparse file. Pack the capture without --sparse."
+
+
 def _check_count(number: int, limits: Limits) -> None:
     if number > limits.files:
         raise ArchiveError(f"The archive has more than {limits.files} entries.")
@@ -173,8 +264,13 @@ def _checked(name: str, seen: set[str]) -> PurePosixPath:
     path = PurePosixPath(name.replace("\\", "/"))
     if path.is_absolute() or ".." in path.parts or ":" in name or any(ord(c) < 32 for c in name) or not path.parts:
         raise ArchiveError(f"{name!r} points outside of the archive or is no name. Pack the capture again.")
-    if len(path.parts) > _MAX_DEPTH or any(len(part.encode("utf-8", "replace")) > _MAX_NAME for part in path.parts):
-        raise ArchiveError(f"{name[:80]!r}… is too long or too deep.")
+    try:
+        sizes = [len(part.encode()) for part in path.parts]
+    except UnicodeEncodeError as error:
+        # tarfile hands on bytes that it cannot decode as halves of characters; nothing could write such a name.
+        raise ArchiveError(f"{name!r} is not UTF-8. Rename it, or pack the capture with names in UTF-8.") from error
+    if len(sizes) > _MAX_DEPTH or max(sizes) > _MAX_NAME or sum(sizes) + len(sizes) > _MAX_PATH:
+        raise ArchiveError(f"{name[:80]!r}… is too long or too deep. Use shorter names and fewer folders.")
     # Where case does not count, one of two would overwrite the other.
     key = str(path).casefold()
     if key in seen:

@@ -11,7 +11,7 @@ from fastapi import Depends, Path, Request
 from jobs.engine import Engine
 from jobs.lease import Leases, open_leases
 from jobs.queue import JobQueue
-from jobs.store import Store
+from jobs.store import Store, discard_leftovers
 from service.archives import Limits
 from service.scenes import RenderPool, Scenes
 from service.settings import Settings
@@ -48,7 +48,7 @@ class Context:
 def open_context(settings: Settings) -> Context:
     """Open the store and the database and pick up what an earlier process left half done."""
     store = Store(settings.data)
-    store.discard_leftovers()
+    discard_leftovers(store.uploads)
     engine = Engine(settings.database_url)
     jobs = JobQueue(store, engine)
     jobs.adopt_strays()

@@ -6,6 +6,7 @@ One table says which error has which status. Knows nothing of what went wrong.
 from __future__ import annotations
 
 import errno
+import json
 import logging
 from http import HTTPStatus
 from typing import Any, ClassVar
@@ -15,7 +16,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 
 from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError
 from jobs.job import JobConflict, JobDamaged, JobError, JobNotFound
@@ -130,7 +131,9 @@ def problem(
         instance=request.url.path,
         errors=errors,
     )
-    return JSONResponse(document.model_dump(exclude_none=True), status, media_type=MEDIA_TYPE, headers=headers)
+    text = json.dumps(document.model_dump(exclude_none=True), ensure_ascii=False, allow_nan=False)
+    # What the client sent may hold halves of characters, as "\\ud800" in JSON; to quote them must not fail.
+    return Response(text.encode("utf-8", "replace"), status, media_type=MEDIA_TYPE, headers=headers)
 
 
 def install(app: FastAPI) -> None:

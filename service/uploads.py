@@ -20,6 +20,7 @@ from anyio import open_file, to_thread
 from starlette.datastructures import FormData, UploadFile
 from starlette.requests import Request
 
+from jobs.store import discard_leftovers
 from service.archives import Limits, unpack
 from service.problems import BadRequest
 
@@ -41,6 +42,8 @@ async def receive_capture(request: Request, uploads: Path, limits: Limits) -> As
 
     `folder` lasts as long as the context unless it is moved away. Raises `ArchiveError` and `BadRequest`.
     """
+    # Here too, not only at the start: what a crash left may fill the disk that this upload needs.
+    await to_thread.run_sync(discard_leftovers, uploads)
     name = uuid.uuid4().hex
     archive, folder = uploads / f"{name}.part", uploads / name
     try:

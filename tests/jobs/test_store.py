@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from jobs.exit_code import ExitCode
 from jobs.files import locked
 from jobs.job import JobConflict, JobDamaged, JobNotFound, JobSpec
-from jobs.store import Store
+from jobs.store import LEFTOVER_S, Store, discard_leftovers
 
 DIGEST = "ab" * 32
 
@@ -120,13 +121,13 @@ def test_a_capture_that_lost_a_file_is_replaced_by_the_same_upload(tmp_path: Pat
     assert list(store.uploads.iterdir()) == []
 
 
-def test_what_dead_processes_left_goes_after_a_day(tmp_path: Path) -> None:
+def test_what_dead_processes_left_goes_when_nothing_was_written_for_an_hour(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    for name in ("old", "young"):
+    ages = {"old": 2 * LEFTOVER_S, "young": 0.5 * LEFTOVER_S, "unpacked": 2 * LEFTOVER_S}
+    for name, age in ages.items():
         (store.uploads / f"{name}.part").write_text("")
-        unpacked(store, name, "a.json")
-        for one in (store.uploads / f"{name}.part", store.uploads / name):
-            if name == "old":
-                os.utime(one, (0, 0))
-    store.discard_leftovers()
-    assert sorted(one.name for one in store.uploads.iterdir()) == ["young", "young.part"]
+        for one in (*unpacked(store, name, "a.json").rglob("*"), store.uploads / name, store.uploads / f"{name}.part"):
+            os.utime(one, (time.time() - age,) * 2)
+    os.utime(store.uploads / "unpacked" / "a.json")  # the archive is old, but somebody is still at work on it
+    discard_leftovers(store.uploads)
+    assert sorted(one.name for one in store.uploads.iterdir()) == ["unpacked", "unpacked.part", "young", "young.part"]

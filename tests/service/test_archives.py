@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import os
 import shutil
+import struct
 import tarfile
+import tracemalloc
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -177,3 +181,76 @@ def test_too_many_entries_are_refused(tmp_path: Path) -> None:
     assert "more than 50 entries" in refused(zipped(tmp_path / "a", many))
     (tmp_path / "a").unlink()
     assert "more than 50 entries" in refused(tarred(tmp_path / "a", *((member(name), b"") for name in many)))
+
+
+@pytest.mark.parametrize(
+    "kind", [tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE], ids=str
+)
+def test_a_name_of_many_megabytes_is_refused_before_it_is_read(tmp_path: Path, kind: bytes) -> None:
+    size = 64 << 20
+    info = member("long", kind)
+    info.size = size
+    with gzip.open(tmp_path / "bomb.tar.gz", "wb", compresslevel=1) as file:
+        file.write(info.tobuf(tarfile.GNU_FORMAT))
+        file.write(bytes(size))
+    (most, message) = peak_of(lambda: refused(tmp_path / "bomb.tar.gz"))
+    assert "headers of more than" in message
+    assert most < 4 << 20
+
+
+def test_many_long_names_before_one_entry_are_refused(tmp_path: Path) -> None:
+    with gzip.open(tmp_path / "bomb.tar.gz", "wb") as file:
+        for _ in range(100):
+            info = member("long", tarfile.GNUTYPE_LONGNAME)
+            info.size = 1024
+            file.write(info.tobuf(tarfile.GNU_FORMAT) + 1024 * b"a")
+    assert "headers of more than" in refused(tmp_path / "bomb.tar.gz")
+
+
+def test_a_sparse_file_is_refused(tmp_path: Path) -> None:
+    refusal = refused(tarred(tmp_path / "a.tar", (member("train/a.png", tarfile.GNUTYPE_SPARSE), b"")))
+    assert "--sparse" in refusal
+
+
+def test_a_zip_of_a_hundred_thousand_entries_is_refused_before_its_list_is_read(tmp_path: Path) -> None:
+    # One entry over and over, as zipfile takes a second to write so many.
+    archive = zipped(tmp_path / "a.zip", {"a.png": b""})
+    content = archive.read_bytes()
+    first, end = content.index(b"PK\1\2"), content.index(b"PK\5\6")
+    many, entry = 100_000, content[first:end]
+    directory = many * entry
+    closing = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 1, 1, len(directory), first, 0)
+    archive.write_bytes(content[:first] + directory + closing)  # and it says that there is one
+    most, message = peak_of(lambda: refused(archive))
+    assert "list of entries" in message
+    assert most < 1 << 20
+
+
+def test_a_zip_that_hides_how_many_entries_it_has_is_refused(tmp_path: Path) -> None:
+    archive = zipped(tmp_path / "a.zip", {f"{i}.png": b"" for i in range(LIMITS.files + 1)})
+    content = bytearray(archive.read_bytes())
+    end = content.index(b"PK\5\6")
+    content[end + 8 : end + 12] = struct.pack("<2H", 1, 1)
+    archive.write_bytes(content)
+    assert f"more than {LIMITS.files} entries" in refused(archive)
+
+
+def test_a_name_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / "a.tar", "w", format=tarfile.GNU_FORMAT, encoding="latin-1") as archive:
+        archive.addfile(member("\xe9a/transforms_train.json"))
+    assert "UTF-8" in refused(tmp_path / "a.tar")
+
+
+def test_a_path_longer_than_a_disk_takes_is_refused(tmp_path: Path) -> None:
+    path = "/".join([*(15 * [255 * "a"]), 205 * "b"])
+    assert "too long" in refused(tarred(tmp_path / "a.tar", (member(path + ".png"), b"x")))
+
+
+def peak_of(call: Callable[[], str]) -> tuple[int, str]:
+    """Most bytes that Python held during a call, and what it gave."""
+    tracemalloc.start()
+    try:
+        given = call()
+        return tracemalloc.get_traced_memory()[1], given
+    finally:
+        tracemalloc.stop()

@@ -48,6 +48,10 @@ def test_every_error_has_its_status_and_says_itself(error: Exception, status: in
         assert document["detail"] == str(error)
 
 
+def test_halves_of_characters_can_be_quoted() -> None:
+    assert problem(raising(ConfigError("no option \udce9a")).get("/"), 422)["detail"] == "no option ?a"
+
+
 @pytest.mark.parametrize(("error", "seconds"), [(Busy("later"), "1"), (JobError("away"), "5")])
 def test_what_is_not_to_be_had_now_says_when_to_come_back(error: Exception, seconds: str) -> None:
     assert raising(error).get("/").headers["retry-after"] == seconds
