@@ -7,16 +7,20 @@ got is on disk.
 
 from __future__ import annotations
 
+import functools
 import logging
+import re
 import sqlite3
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, WorkflowStatus
+from dbos import error as dbos_error
+from sqlalchemy import exc  # DBOS depends on it, so it is always there
 
-from jobs.job import JobError, JobState, Outcome
+from jobs.job import JobConflict, JobError, JobState, Outcome
 
 QUEUE = "train"
 WORKFLOW = "train"
@@ -48,26 +52,55 @@ class Ticket:
     error: str | None
 
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _asking(
+    method: Callable[Concatenate[Engine, P], T],
+) -> Callable[Concatenate[Engine, P], T]:
+    """`method`, with one `JobError` for whatever shows that the database is away."""
+
+    @functools.wraps(method)
+    def asked(self: Engine, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return method(self, *args, **kwargs)
+        except (exc.OperationalError, exc.InterfaceError, exc.TimeoutError) as error:
+            raise JobError(f"The job database does not answer: {_reason(error, self.url)}. Try again later.") from error
+
+    return asked
+
+
 class Engine:
-    """The queue, seen from outside. Safe to use from several threads."""
+    """The queue, seen from outside. Safe to use from several threads.
+
+    Every method raises `JobError` while the database is away.
+    """
 
     def __init__(self, url: str) -> None:
         self.url = url
         try:
             _prepare(url)
             self._client = DBOSClient(
-                system_database_url=url, application_name=APPLICATION, serializer=DBOSPortableJSONSerializer()
+                system_database_url=url,
+                application_name=APPLICATION,
+                serializer=DBOSPortableJSONSerializer(),
+                # Who asks would else wait in its thread for as long as the database is away, in the end all threads.
+                retry_connection_errors=False,
             )
         except Exception as error:  # whatever the database driver raises, it means one thing
-            why = (str(error).splitlines() or [repr(error)])[0]
-            raise JobError(f"The job database {_without_password(url)} cannot be opened: {why}") from error
+            # Of other addresses no more than their kind: a password may be anywhere in them.
+            named = url if url.startswith(_SQLITE) else f"({re.split('[:/]', url)[0]})"
+            raise JobError(f"The job database {named} cannot be opened: {_reason(error, url)}") from error
 
+    @_asking
     def enqueue(self, job_id: str, priority: int) -> None:
         """Put a job in the queue; one that is there already stays as it is."""
         self._client.enqueue(
             {"workflow_name": WORKFLOW, "queue_name": QUEUE, "workflow_id": job_id, "priority": priority}, job_id
         )
 
+    @_asking
     def tickets(self, job_ids: Sequence[str]) -> dict[str, Ticket]:
         """The places of these jobs; those the queue does not know are left out."""
         if not job_ids:
@@ -75,29 +108,41 @@ class Engine:
         found = self._client.list_workflows(workflow_ids=list(job_ids), load_input=False)
         return {status.workflow_id: _ticket(status) for status in found}
 
+    @_asking
     def running(self) -> list[Ticket]:
         """All jobs that a worker has taken, whether or not it still lives."""
         found = self._client.list_workflows(status="PENDING", name=WORKFLOW, load_input=False, load_output=False)
         return [_ticket(status) for status in found]
 
+    @_asking
     def waiting(self) -> int:
         """How many jobs wait for a worker."""
         return len(self._client.list_workflows(status="ENQUEUED", name=WORKFLOW, load_input=False, load_output=False))
 
+    @_asking
     def cancel(self, job_id: str) -> None:
         """Take a job out of the queue; its worker, if any, stops within two seconds."""
         self._client.cancel_workflow(job_id)
 
+    @_asking
     def requeue(self, job_ids: Sequence[str]) -> None:
         """Put jobs that were cancelled or lost their worker back in the queue."""
         if job_ids:
             # Without a name they would land in DBOS's internal queue, which has no limit on concurrency.
             self._client.resume_workflows(list(job_ids), queue_name=QUEUE)
 
+    @_asking
     def rewind(self, job_id: str) -> None:
-        """Put a job that ended back in the queue."""
-        self._client.rewind_workflow(job_id, queue_name=QUEUE, application_version=VERSION)
+        """Put a job that ended back in the queue. Raises `JobConflict` when it is not there or no longer ended."""
+        try:
+            self._client.rewind_workflow(job_id, queue_name=QUEUE, application_version=VERSION)
+        except dbos_error.DBOSException as error:
+            raise JobConflict(
+                f"Job {job_id} cannot be tried again: the queue has lost it, or it was queued again meanwhile. "
+                "Look at it again, or delete it and submit a new one."
+            ) from error
 
+    @_asking
     def delete(self, job_id: str) -> None:
         """Forget a job."""
         self._client.delete_workflow(job_id)
@@ -166,6 +211,20 @@ def _ticket(status: WorkflowStatus) -> Ticket:
     return Ticket(status.workflow_id, state, status.executor_id, None if finished is None else finished / 1000.0, error)
 
 
-def _without_password(url: str) -> str:
-    scheme, at, rest = url.rpartition("@")
-    return f"{scheme.split('://')[0]}://…@{rest}" if at else url
+def _reason(error: Exception, url: str) -> str:
+    """The first line of an error without what may be a password of `url`."""
+    reason = (str(error).splitlines() or [repr(error)])[0]
+    for secret in _secrets(url):
+        reason = reason.replace(secret, "…")
+    return reason
+
+
+def _secrets(url: str) -> list[str]:
+    """Parts of what stands between the user's name and the last @, and of a password among the parameters.
+
+    Parts, because a driver takes a password with an @ or a / in it for a host or a path, and says so.
+    """
+    before, _, _ = url.rpartition("@")
+    _, _, given = before.rpartition("//")[2].partition(":")
+    texts = [given, *re.findall(r"[?&]password=([^&]*)", url)]
+    return [part for text in texts for part in re.split("[@/:?#]", text) if part]

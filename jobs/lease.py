@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import logging
 import os
 import threading
 from pathlib import Path
 from typing import Protocol
 
 import psycopg  # DBOS depends on it, so it is always there
+
+from jobs.job import JobError
+
+LOG = logging.getLogger(__name__)
 
 _NAMESPACE = 0x67726169  # "grai": first key of our advisory locks, apart from everybody else's
 
@@ -123,8 +128,21 @@ class PostgresLeases:
     def _connect(self) -> psycopg.Connection[tuple[object, ...]]:
         # Keepalives notice within half a minute that the other machine is gone.
         return psycopg.connect(
-            self._url, autocommit=True, keepalives=1, keepalives_idle=10, keepalives_interval=5, keepalives_count=3
+            self._url,
+            autocommit=True,
+            connect_timeout=10,
+            keepalives=1,
+            keepalives_idle=10,
+            keepalives_interval=5,
+            keepalives_count=3,
         )
+
+    def _reconnect(self) -> None:
+        """Begin a new session. The server let go of our leases with the old one."""
+        with self._guard:
+            self._connection.close()
+            self._connection = self._connect()
+            self._held.clear()
 
     @staticmethod
     def _key(name: str) -> int:
@@ -145,10 +163,7 @@ class PostgresLeases:
         try:
             self._ask("select 1")
         except psycopg.OperationalError:
-            with self._guard:
-                self._connection.close()
-                self._connection = self._connect()
-            self._held.clear()
+            self._reconnect()
         return name in self._held or self.take(name)
 
     def take_from_the_dead(self, name: str) -> bool:
@@ -160,9 +175,20 @@ class PostgresLeases:
             self._ask("select pg_advisory_unlock(%s, %s)", _NAMESPACE, self._key(name))
 
     def alive(self) -> int:
-        count = self._ask(
-            "select count(*) from pg_locks where locktype = 'advisory' and classid = %s and granted", _NAMESPACE
+        """Raises `JobError` while the database is away."""
+        query = (
+            "select count(*) from pg_locks where locktype = 'advisory' and classid = %s and granted "
+            "and database = (select oid from pg_database where datname = current_database())"
         )
+        try:
+            count = self._ask(query, _NAMESPACE)
+        except psycopg.OperationalError as lost:
+            LOG.info("asking for leases anew: %s", lost)
+            try:
+                self._reconnect()
+                count = self._ask(query, _NAMESPACE)
+            except psycopg.OperationalError as error:
+                raise JobError("The job database does not answer. Try again later.") from error
         return int(str(count))
 
     def close(self) -> None:

@@ -91,7 +91,12 @@ class JobQueue:
         """Queue a job that failed or diverged again; it continues from its last checkpoint, if it has one."""
         job = self.get(job_id)
         if job.state in (JobState.FAILED, JobState.DIVERGED):
-            self._engine.rewind(job_id)
+            try:
+                self._engine.rewind(job_id)
+            except JobConflict:
+                if self.get(job_id).state.final:
+                    raise
+                LOG.info("job %s was queued again by somebody else", job_id)
         elif job.state is JobState.CANCELLED:
             raise JobConflict(f"Job {job_id} was cancelled, it did not fail. Use resume.")
         elif job.state is JobState.SUCCEEDED:

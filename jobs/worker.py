@@ -53,7 +53,10 @@ class Worker:
                 LOG.info("worker %s takes jobs: %d at a time, %d threads each", self.id, self._slots, self._threads)
                 self._rounds(engine, leases, stop)
                 self._stop_all()
-            engine.requeue([ticket.job_id for ticket in engine.running() if ticket.executor == self.id])
+            try:
+                engine.requeue([ticket.job_id for ticket in engine.running() if ticket.executor == self.id])
+            except JobError as error:
+                LOG.error("jobs of worker %s wait until another one finds its lease free: %s", self.id, error)
         finally:
             leases.close()
             engine.close()

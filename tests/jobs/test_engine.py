@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from jobs.engine import Engine, executing
-from jobs.job import JobError, JobState, Outcome
+from jobs.job import JobConflict, JobError, JobState, Outcome
 
 LONG_S = 20.0
 
@@ -121,9 +121,38 @@ def test_leaving_stops_what_runs_and_another_worker_can_have_it(engine: Engine) 
         until(lambda: state(engine, "a") is JobState.SUCCEEDED)
 
 
-def test_a_database_that_cannot_be_opened_is_named_without_its_password(tmp_path: Path) -> None:
+def test_a_database_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
     with pytest.raises(JobError, match="nowhere"):
         Engine(f"sqlite:///{tmp_path}/nowhere/jobs.sqlite")
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "postgresql://me:secret@127.0.0.1:1/none?connect_timeout=1",
+        "postgresql://127.0.0.1:1/none?connect_timeout=1&user=me&password=secret",
+        "postgresql//me:secret@127.0.0.1",
+        "postgresql://me:other@secret@127.0.0.1:1/none",
+        "postgresql://me:other/secret@127.0.0.1:1/none",
+    ],
+)
+def test_a_database_that_cannot_be_opened_is_named_without_its_password_of_any_form(url: str) -> None:
     with pytest.raises(JobError) as caught:
-        Engine("postgresql://me:secret@127.0.0.1:1/none?connect_timeout=1")
+        Engine(url)
     assert "secret" not in str(caught.value)
+    assert "other" not in str(caught.value)
+    assert "postgresql" in str(caught.value)
+
+
+def test_who_comes_second_with_a_retry_is_told_so(engine: Engine) -> None:
+    async def fail(_: str) -> Outcome:
+        return Outcome(JobState.FAILED, "no")
+
+    engine.enqueue("a", 10)
+    with executing(engine.url, "worker-a", 1, fail):
+        until(lambda: state(engine, "a") is JobState.FAILED)
+    engine.rewind("a")
+    with pytest.raises(JobConflict, match="queued again meanwhile"):
+        engine.rewind("a")
+    with pytest.raises(JobConflict, match="submit a new one"):
+        engine.rewind("of another queue")
