@@ -56,6 +56,7 @@ _BROKEN = (
     IndexError,
     gzip.BadGzipFile,
 )
+_NEGATIVE = "The archive is damaged: an entry has a negative size. Pack the capture again."
 # What reading says of a place that a damaged header points to; a full disk is no fault of the archive.
 _NOWHERE = (errno.EINVAL, errno.EOVERFLOW)
 
@@ -247,9 +248,6 @@ def _bounded_headers() -> type[tarfile.TarInfo]:
     return Header
 
 
-_NEGATIVE = "The archive is damaged: an entry has a negative size. Pack the capture again."
-
-
 def _sparse(name: str) -> str:
     return f"{name!r} is a sparse file. Pack the capture without --sparse."
 
@@ -267,7 +265,7 @@ def _checked(name: str, seen: set[str]) -> PurePosixPath:
     try:
         sizes = [len(part.encode()) for part in path.parts]
     except UnicodeEncodeError as error:
-        # tarfile hands on bytes that it cannot decode as halves of characters; nothing could write such a name.
+        # tarfile hands on bytes that it cannot decode as halves of characters; no document could quote such a name.
         raise ArchiveError(f"{name!r} is not UTF-8. Rename it, or pack the capture with names in UTF-8.") from error
     if len(sizes) > _MAX_DEPTH or max(sizes) > _MAX_NAME or sum(sizes) + len(sizes) > _MAX_PATH:
         raise ArchiveError(f"{name[:80]!r}… is too long or too deep. Use shorter names and fewer folders.")

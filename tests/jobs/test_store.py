@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import os
+import shutil
+import stat
 import time
 from pathlib import Path
 
@@ -121,13 +123,87 @@ def test_a_capture_that_lost_a_file_is_replaced_by_the_same_upload(tmp_path: Pat
     assert list(store.uploads.iterdir()) == []
 
 
-def test_what_dead_processes_left_goes_when_nothing_was_written_for_an_hour(tmp_path: Path) -> None:
+def age(path: Path, seconds: float) -> None:
+    """Have everything at and below `path` look as if written so long ago."""
+    then = time.time() - seconds
+    for one in (path, *path.rglob("*")):
+        os.utime(one, (then, then))
+
+
+def test_what_nobody_wrote_to_for_long_is_removed(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    ages = {"old": 2 * LEFTOVER_S, "young": 0.5 * LEFTOVER_S, "unpacked": 2 * LEFTOVER_S}
-    for name, age in ages.items():
+    for name, seconds in (("old", LEFTOVER_S + 60), ("young", LEFTOVER_S - 60)):
         (store.uploads / f"{name}.part").write_text("")
-        for one in (*unpacked(store, name, "a.json").rglob("*"), store.uploads / name, store.uploads / f"{name}.part"):
-            os.utime(one, (time.time() - age,) * 2)
-    os.utime(store.uploads / "unpacked" / "a.json")  # the archive is old, but somebody is still at work on it
+        unpacked(store, name, "train/a.json")
+        age(store.uploads / f"{name}.part", seconds)
+        age(store.uploads / name, seconds)
     discard_leftovers(store.uploads)
-    assert sorted(one.name for one in store.uploads.iterdir()) == ["unpacked", "unpacked.part", "young", "young.part"]
+    assert sorted(one.name for one in store.uploads.iterdir()) == ["young", "young.part"]
+
+
+def test_an_upload_that_is_being_unpacked_is_no_leftover(tmp_path: Path) -> None:
+    """Its archive came long ago and its folder was made long ago: only a file deep inside is new."""
+    store = Store(tmp_path)
+    (store.uploads / "u.part").write_text("")
+    folder = unpacked(store, "u", "train/a.json")
+    for one in (store.uploads / "u.part", folder):
+        age(one, 2 * LEFTOVER_S)
+    (folder / "train" / "a.json").write_text("more")
+    discard_leftovers(store.uploads)
+    assert sorted(one.name for one in store.uploads.iterdir()) == ["u", "u.part"]
+
+
+def test_a_leftover_that_cannot_be_removed_is_logged_and_keeps_none_of_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = Store(tmp_path)
+    for name in ("u", "v"):
+        age(unpacked(store, name, "a.json"), 2 * LEFTOVER_S)
+    (store.uploads / "w.part").write_text("")
+    age(store.uploads / "w.part", 2 * LEFTOVER_S)
+
+    def denied(path: Path) -> None:
+        raise PermissionError(f"{path}: denied")
+
+    monkeypatch.setattr(shutil, "rmtree", denied)
+    discard_leftovers(store.uploads)
+    assert sorted(one.name for one in store.uploads.iterdir()) == ["u", "v"]
+    assert caplog.text.count("denied") == 2
+
+
+def test_an_old_job_that_is_being_deleted_is_no_leftover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process that cleans up meanwhile would make the deletion fail."""
+    store = Store(tmp_path)
+    job_id = store.create(spec(), unpacked(store, "u", "a.json"))
+    store.folder(job_id).lock.touch()  # a trainer was at it once
+    age(store.folder(job_id).path, 2 * LEFTOVER_S)
+    remove = shutil.rmtree
+
+    def slowly(path: Path, **options: bool) -> None:
+        monkeypatch.setattr(shutil, "rmtree", remove)
+        discard_leftovers(store.uploads)
+        remove(path, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", slowly)
+    store.delete(job_id)
+    assert store.ids() == []
+    assert list((tmp_path / "captures").iterdir()) == []
+
+
+def test_a_new_job_is_on_the_disk_before_anyone_hears_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rename that only the memory knows of is lost with the power: its folder must be synced after it."""
+    store = Store(tmp_path)
+    synced: list[tuple[int, list[str]]] = []
+
+    def fsync(handle: int) -> None:
+        inode = os.fstat(handle).st_ino
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            synced.append((inode, os.listdir(handle)))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    job_id = store.create(spec(), unpacked(store, "u", "a.json"))
+    assert ((tmp_path / "captures").stat().st_ino, [DIGEST]) in synced
+    assert (store.folder(job_id).path.stat().st_ino, ["job.json"]) in synced
+    assert synced[-1] == ((tmp_path / "jobs").stat().st_ino, [job_id])
+    store.folder(job_id).begin_attempt("worker")
+    assert "attempts.json" in synced[-1][1]

@@ -10,7 +10,8 @@ import struct
 import tarfile
 import tracemalloc
 import zipfile
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -183,74 +184,160 @@ def test_too_many_entries_are_refused(tmp_path: Path) -> None:
     assert "more than 50 entries" in refused(tarred(tmp_path / "a", *((member(name), b"") for name in many)))
 
 
-@pytest.mark.parametrize(
-    "kind", [tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE], ids=str
-)
-def test_a_name_of_many_megabytes_is_refused_before_it_is_read(tmp_path: Path, kind: bytes) -> None:
-    size = 64 << 20
-    info = member("long", kind)
-    info.size = size
-    with gzip.open(tmp_path / "bomb.tar.gz", "wb", compresslevel=1) as file:
-        file.write(info.tobuf(tarfile.GNU_FORMAT))
-        file.write(bytes(size))
-    (most, message) = peak_of(lambda: refused(tmp_path / "bomb.tar.gz"))
-    assert "headers of more than" in message
-    assert most < 4 << 20
-
-
-def test_many_long_names_before_one_entry_are_refused(tmp_path: Path) -> None:
-    with gzip.open(tmp_path / "bomb.tar.gz", "wb") as file:
-        for _ in range(100):
-            info = member("long", tarfile.GNUTYPE_LONGNAME)
-            info.size = 1024
-            file.write(info.tobuf(tarfile.GNU_FORMAT) + 1024 * b"a")
-    assert "headers of more than" in refused(tmp_path / "bomb.tar.gz")
-
-
-def test_a_sparse_file_is_refused(tmp_path: Path) -> None:
-    refusal = refused(tarred(tmp_path / "a.tar", (member("train/a.png", tarfile.GNUTYPE_SPARSE), b"")))
-    assert "--sparse" in refusal
-
-
-def test_a_zip_of_a_hundred_thousand_entries_is_refused_before_its_list_is_read(tmp_path: Path) -> None:
-    # One entry over and over, as zipfile takes a second to write so many.
-    archive = zipped(tmp_path / "a.zip", {"a.png": b""})
-    content = archive.read_bytes()
-    first, end = content.index(b"PK\1\2"), content.index(b"PK\5\6")
-    many, entry = 100_000, content[first:end]
-    directory = many * entry
-    closing = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 1, 1, len(directory), first, 0)
-    archive.write_bytes(content[:first] + directory + closing)  # and it says that there is one
-    most, message = peak_of(lambda: refused(archive))
-    assert "list of entries" in message
-    assert most < 1 << 20
-
-
-def test_a_zip_that_hides_how_many_entries_it_has_is_refused(tmp_path: Path) -> None:
-    archive = zipped(tmp_path / "a.zip", {f"{i}.png": b"" for i in range(LIMITS.files + 1)})
-    content = bytearray(archive.read_bytes())
-    end = content.index(b"PK\5\6")
-    content[end + 8 : end + 12] = struct.pack("<2H", 1, 1)
-    archive.write_bytes(content)
-    assert f"more than {LIMITS.files} entries" in refused(archive)
-
-
-def test_a_name_that_is_not_utf8_is_refused(tmp_path: Path) -> None:
-    with tarfile.open(tmp_path / "a.tar", "w", format=tarfile.GNU_FORMAT, encoding="latin-1") as archive:
-        archive.addfile(member("\xe9a/transforms_train.json"))
-    assert "UTF-8" in refused(tmp_path / "a.tar")
-
-
-def test_a_path_longer_than_a_disk_takes_is_refused(tmp_path: Path) -> None:
-    path = "/".join([*(15 * [255 * "a"]), 205 * "b"])
-    assert "too long" in refused(tarred(tmp_path / "a.tar", (member(path + ".png"), b"x")))
-
-
-def peak_of(call: Callable[[], str]) -> tuple[int, str]:
-    """Most bytes that Python held during a call, and what it gave."""
+@contextmanager
+def at_most(size: int) -> Iterator[None]:
+    """Fails if more than `size` bytes are allocated at any time inside."""
     tracemalloc.start()
     try:
-        given = call()
-        return tracemalloc.get_traced_memory()[1], given
+        yield
+        assert tracemalloc.get_traced_memory()[1] < size
     finally:
         tracemalloc.stop()
+
+
+def header(kind: bytes, size: int, name: str = "x") -> bytes:
+    """The block with which an entry of a tar begins; what follows it is up to the test."""
+    info = member(name, kind)
+    info.size = size
+    return info.tobuf(tarfile.GNU_FORMAT)
+
+
+EXTENSIONS = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE, b"X")
+
+
+@pytest.mark.parametrize("kind", EXTENSIONS)
+@pytest.mark.parametrize("size", [32 << 20, -512])
+def test_a_header_of_any_size_is_refused_before_it_is_read(tmp_path: Path, kind: bytes, size: int) -> None:
+    """tarfile reads these whole, and with a negative size everything to the end."""
+    (tmp_path / "a").write_bytes(gzip.compress(header(kind, size) + bytes(32 << 20), compresslevel=1))
+    with at_most(4 << 20):
+        message = refused(tmp_path / "a")
+    assert ("negative size" if size < 0 else "extended attributes") in message
+
+
+@pytest.mark.parametrize("kind", EXTENSIONS)
+def test_many_headers_before_one_entry_count_together(tmp_path: Path, kind: bytes) -> None:
+    headers = (header(kind, 30 << 10) + bytes(30 << 10)) * 3
+    (tmp_path / "a").write_bytes(headers + header(tarfile.REGTYPE, 0, "x.json") + bytes(1024))
+    assert "extended attributes" in refused(tmp_path / "a")
+
+
+def test_global_headers_count_for_all_entries(tmp_path: Path) -> None:
+    each = header(tarfile.XGLTYPE, 30 << 10) + bytes(30 << 10)
+    entries = b"".join(each + header(tarfile.REGTYPE, 0, f"{i}.json") for i in range(3))
+    (tmp_path / "a").write_bytes(entries + bytes(1024))
+    assert "extended attributes" in refused(tmp_path / "a")
+
+
+def test_what_headers_say_is_not_kept_beyond_their_entry(tmp_path: Path) -> None:
+    """40 KB for each of 200 entries is allowed, and is not held 200 times."""
+    with tarfile.open(tmp_path / "a", "w:gz", format=tarfile.PAX_FORMAT) as archive:
+        for number in range(200):
+            info = member(f"{number}.json")
+            info.pax_headers = {"comment": f"{number}" + "x" * 40_000}
+            archive.addfile(info)
+    with at_most(4 << 20):
+        assert unpack(tmp_path / "a", tmp_path / "out", Limits(files=200, bytes=1)).files == 200
+
+
+@pytest.mark.parametrize("format", [tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
+def test_names_as_long_as_a_path_may_be_come_out(tmp_path: Path, format: int) -> None:
+    name = "/".join(["d" * 250] * 7) + "/x.json"
+    with tarfile.open(tmp_path / "a", "w", format=format) as archive:
+        archive.addfile(member(name))
+    unpack(tmp_path / "a", tmp_path / "out", LIMITS)
+    assert (tmp_path / "out" / name).is_file()
+
+
+def test_a_sparse_file_is_refused_before_its_map_is_read(tmp_path: Path) -> None:
+    """tarfile keeps the map as a list of numbers, as long as the archive likes."""
+    more = struct.pack("504sB7x", b"00000000001\0" * 42, 1)  # a block of the map, and that another one follows
+    first = bytearray(header(tarfile.GNUTYPE_SPARSE, 0, "x.json"))
+    first[482] = 1  # the map goes on after the header
+    first[148:156] = b"%06o\0 " % tarfile.calc_chksums(bytes(first))[0]  # type: ignore[attr-defined]
+    (tmp_path / "a").write_bytes(bytes(first) + more * 5_000)
+    with at_most(1 << 20):
+        assert "sparse" in refused(tmp_path / "a")
+
+    info = member("x.json")
+    info.pax_headers = {"GNU.sparse.major": "1", "GNU.sparse.minor": "0"}
+    numbers = b"1000000\n" + b"1\n" * 2_000_000
+    info.size = len(numbers)
+    with tarfile.open(tmp_path / "a", "w", format=tarfile.PAX_FORMAT) as archive:
+        archive.addfile(info, io.BytesIO(numbers))
+    with at_most(1 << 20):
+        assert "sparse" in refused(tmp_path / "a")
+
+
+def test_a_file_of_negative_size_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(header(tarfile.REGTYPE, -512, "x.json") + bytes(1024))
+    assert "negative size" in refused(tmp_path / "a")
+
+
+def directory(records: int, comment: int, declared: int) -> bytes:
+    """A zip that is nothing but a directory: of `records` entries with `comment` bytes each, said to be `declared`."""
+    fields = (b"PK\x01\x02", 20, 3, 20, 0, 0, 0, 0, 33, 0, 0, 0, 1, 0, comment, 0, 0, 0, 0)
+    record = struct.pack("<4s4B4H3L5H2L", *fields) + b"a" + b"c" * comment
+    size = records * len(record)
+    return record * records + struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, declared, declared, size, 0, 0)
+
+
+@pytest.mark.parametrize("declared", [20_000, 1])
+def test_entries_of_a_zip_are_counted_before_they_are_read(tmp_path: Path, declared: int) -> None:
+    (tmp_path / "a").write_bytes(directory(20_000, 0, declared))
+    with at_most(2 << 20):
+        assert "more than 50 entries" in refused(tmp_path / "a")
+
+
+def test_a_zip_whose_directory_is_far_too_large_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(directory(40, 60_000, 40))
+    with at_most(1 << 20):
+        assert "list of entries" in refused(tmp_path / "a")
+
+
+def test_a_zip_of_few_entries_may_say_as_much_of_each_as_the_format_lets_it(tmp_path: Path) -> None:
+    limits = Limits(files=5, bytes=50)
+    with zipfile.ZipFile(tmp_path / "a", "w") as archive:
+        for number in range(5):
+            info = zipfile.ZipInfo(f"{number}.json")
+            info.comment = bytes(65_535)
+            info.extra = struct.pack("<2H", 0xFFFF, 65_531) + bytes(65_531)
+            archive.writestr(info, "{}")
+    assert unpack(tmp_path / "a", tmp_path / "out", limits).files == 5
+
+
+def test_a_zip64_with_as_many_entries_as_allowed_comes_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The directory lies elsewhere in it, so that counting in the wrong place would find less."""
+    monkeypatch.setattr(zipfile, "ZIP_FILECOUNT_LIMIT", 5)
+    archive = zipped(tmp_path / "a", {f"{i}.json": b"{}" for i in range(50)})
+    assert b"PK\x06\x06" in archive.read_bytes()
+    assert unpack(archive, tmp_path / "out", LIMITS).files == 50
+    shutil.rmtree(tmp_path / "out")
+    assert "more than 49 entries" in refused(archive, Limits(files=49, bytes=50_000))
+    content = bytearray(archive.read_bytes())
+    content[content.rindex(b"PK\x06\x06") + 32] = 1  # and it says that there is one
+    archive.write_bytes(content)
+    with monkeypatch.context() as patch:
+        patch.setattr(zipfile, "ZipFile", None)  # which would find them all
+        assert "more than 49 entries" in refused(archive, Limits(files=49, bytes=50_000))
+
+
+def test_a_name_that_is_not_utf8_is_refused_with_its_remedy(tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / "a", "w", format=tarfile.GNU_FORMAT, encoding="latin-1") as archive:
+        archive.addfile(member("caf\u00e9.json"))
+    message = refused(tmp_path / "a")
+    assert "not UTF-8" in message
+    message.encode()
+
+
+def test_a_path_that_no_disk_takes_is_refused_with_its_remedy(tmp_path: Path) -> None:
+    name = "/".join(["d" * 255] * 15 + ["e" * 200 + ".json"])
+    assert "Use shorter names" in refused(zipped(tmp_path / "a", {name: b"{}"}))
+
+
+def test_a_path_that_is_too_long_only_here_is_refused_with_its_remedy(tmp_path: Path) -> None:
+    """Where the folder of the store lies deep itself."""
+    deep = tmp_path.joinpath(*["d" * 250] * 10)
+    deep.mkdir(parents=True)
+    name = "/".join(["e" * 250] * 7 + ["x.json"])
+    assert "disk of the service" in refused(zipped(deep / "a", {name: b"{}"}))
