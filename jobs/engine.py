@@ -7,20 +7,23 @@ got is on disk.
 
 from __future__ import annotations
 
-import functools
 import logging
 import re
 import sqlite3
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Final
+from urllib.parse import unquote
 
-from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, WorkflowStatus
+import psycopg  # DBOS depends on it and on SQLAlchemy, so both are always there
+from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, EnqueueOptions, WorkflowStatus
 from dbos import error as dbos_error
-from sqlalchemy import exc  # DBOS depends on it, so it is always there
+from sqlalchemy import exc, make_url
 
 from jobs.job import JobConflict, JobError, JobState, Outcome
+
+LOG = logging.getLogger(__name__)
 
 QUEUE = "train"
 WORKFLOW = "train"
@@ -30,7 +33,26 @@ APPLICATION = "graings"
 VERSION = "jobs-1"
 POLL_S = 0.5
 
+# How long to wait for a PostgreSQL that is out of reach: five seconds for a connection, a quarter of a minute for the
+# answer of another machine's kernel, half a minute for a silent connection. What the URL says itself counts more.
+PATIENCE: Final = {
+    "connect_timeout": "5",
+    "tcp_user_timeout": "15000",
+    "keepalives": "1",
+    "keepalives_idle": "10",
+    "keepalives_interval": "5",
+    "keepalives_count": "3",
+}
+
 _SQLITE = "sqlite:///"
+# What a query raises when there is no connection to be had.
+_AWAY = (
+    exc.OperationalError,
+    exc.InterfaceError,
+    exc.TimeoutError,
+    psycopg.OperationalError,
+    dbos_error.DBOSQueryTimeoutError,
+)
 _STATES = {
     "DELAYED": JobState.QUEUED,
     "ENQUEUED": JobState.QUEUED,
@@ -52,100 +74,105 @@ class Ticket:
     error: str | None
 
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def _asking(
-    method: Callable[Concatenate[Engine, P], T],
-) -> Callable[Concatenate[Engine, P], T]:
-    """`method`, with one `JobError` for whatever shows that the database is away."""
-
-    @functools.wraps(method)
-    def asked(self: Engine, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        try:
-            return method(self, *args, **kwargs)
-        except (exc.OperationalError, exc.InterfaceError, exc.TimeoutError) as error:
-            raise JobError(f"The job database does not answer: {_reason(error, self.url)}. Try again later.") from error
-
-    return asked
-
-
 class Engine:
     """The queue, seen from outside. Safe to use from several threads.
 
-    Every method raises `JobError` while the database is away.
+    All methods raise `JobError` while the database is away.
     """
 
     def __init__(self, url: str) -> None:
         self.url = url
         try:
-            _prepare(url)
+            patient = _with_patience(url)
+            _prepare(patient)
             self._client = DBOSClient(
-                system_database_url=url,
+                system_database_url=patient,
                 application_name=APPLICATION,
                 serializer=DBOSPortableJSONSerializer(),
-                # Who asks would else wait in its thread for as long as the database is away, in the end all threads.
+                # Otherwise every caller waits until the database is back, and holds a thread of the service meanwhile.
                 retry_connection_errors=False,
             )
         except Exception as error:  # whatever the database driver raises, it means one thing
-            # Of other addresses no more than their kind: a password may be anywhere in them.
-            named = url if url.startswith(_SQLITE) else f"({re.split('[:/]', url)[0]})"
-            raise JobError(f"The job database {named} cannot be opened: {_reason(error, url)}") from error
+            raise cannot_open(url, error) from error
 
-    @_asking
+    @contextmanager
+    def _asking(self) -> Iterator[None]:
+        """Have what the database raises when it is away mean one thing, in words without its URL."""
+        try:
+            yield
+        except _AWAY as error:
+            raise no_answer(self.url, error) from error
+
     def enqueue(self, job_id: str, priority: int) -> None:
         """Put a job in the queue; one that is there already stays as it is."""
-        self._client.enqueue(
-            {"workflow_name": WORKFLOW, "queue_name": QUEUE, "workflow_id": job_id, "priority": priority}, job_id
-        )
+        options: EnqueueOptions = {
+            "workflow_name": WORKFLOW,
+            "queue_name": QUEUE,
+            "workflow_id": job_id,
+            "priority": priority,
+        }
+        with self._asking():
+            self._client.enqueue(options, job_id)
 
-    @_asking
     def tickets(self, job_ids: Sequence[str]) -> dict[str, Ticket]:
         """The places of these jobs; those the queue does not know are left out."""
         if not job_ids:
             return {}
-        found = self._client.list_workflows(workflow_ids=list(job_ids), load_input=False)
+        with self._asking():
+            found = self._client.list_workflows(workflow_ids=list(job_ids), load_input=False)
         return {status.workflow_id: _ticket(status) for status in found}
 
-    @_asking
     def running(self) -> list[Ticket]:
         """All jobs that a worker has taken, whether or not it still lives."""
-        found = self._client.list_workflows(status="PENDING", name=WORKFLOW, load_input=False, load_output=False)
-        return [_ticket(status) for status in found]
+        return [_ticket(status) for status in self._in_state("PENDING")]
 
-    @_asking
     def waiting(self) -> int:
         """How many jobs wait for a worker."""
-        return len(self._client.list_workflows(status="ENQUEUED", name=WORKFLOW, load_input=False, load_output=False))
+        return len(self._in_state("ENQUEUED"))
 
-    @_asking
+    def _in_state(self, status: str) -> list[WorkflowStatus]:
+        with self._asking():
+            return self._client.list_workflows(status=status, name=WORKFLOW, load_input=False, load_output=False)
+
     def cancel(self, job_id: str) -> None:
         """Take a job out of the queue; its worker, if any, stops within two seconds."""
-        self._client.cancel_workflow(job_id)
+        with self._asking():
+            self._client.cancel_workflow(job_id)
 
-    @_asking
     def requeue(self, job_ids: Sequence[str]) -> None:
-        """Put jobs that were cancelled or lost their worker back in the queue."""
-        if job_ids:
-            # Without a name they would land in DBOS's internal queue, which has no limit on concurrency.
-            self._client.resume_workflows(list(job_ids), queue_name=QUEUE)
+        """Put jobs that were cancelled or lost their worker back in the queue.
 
-    @_asking
-    def rewind(self, job_id: str) -> None:
-        """Put a job that ended back in the queue. Raises `JobConflict` when it is not there or no longer ended."""
+        Raises `JobConflict`, and leaves all of them where they are, when the queue does not know one.
+        """
+        if not job_ids:
+            return
         try:
-            self._client.rewind_workflow(job_id, queue_name=QUEUE, application_version=VERSION)
-        except dbos_error.DBOSException as error:
+            with self._asking():
+                # Without a name they would land in DBOS's internal queue, which has no limit on concurrency.
+                self._client.resume_workflows(list(job_ids), queue_name=QUEUE)
+        except dbos_error.DBOSNonExistentWorkflowError as error:
+            raise _unknown(job_ids) from error
+
+    def rewind(self, job_id: str) -> None:
+        """Put a job that ended back in the queue.
+
+        Raises `JobConflict` when it has not ended, or no longer, or the queue does not know it.
+        """
+        try:
+            with self._asking():
+                self._client.rewind_workflow(job_id, queue_name=QUEUE, application_version=VERSION)
+        except dbos_error.DBOSNonExistentWorkflowError as error:
+            raise _unknown([job_id]) from error
+        except dbos_error.DBOSException as error:  # the other things it can mean are all one: somebody else was at it
             raise JobConflict(
-                f"Job {job_id} cannot be tried again: the queue has lost it, or it was queued again meanwhile. "
-                "Look at it again, or delete it and submit a new one."
+                f"Job {job_id} changed its state while it was put back in the queue. Look at it, and retry if it "
+                "still needs that."
             ) from error
 
-    @_asking
     def delete(self, job_id: str) -> None:
         """Forget a job."""
-        self._client.delete_workflow(job_id)
+        with self._asking():
+            self._client.delete_workflow(job_id)
 
     def close(self) -> None:
         self._client.destroy()
@@ -211,20 +238,75 @@ def _ticket(status: WorkflowStatus) -> Ticket:
     return Ticket(status.workflow_id, state, status.executor_id, None if finished is None else finished / 1000.0, error)
 
 
-def _reason(error: Exception, url: str) -> str:
-    """The first line of an error without what may be a password of `url`."""
-    reason = (str(error).splitlines() or [repr(error)])[0]
+def _unknown(job_ids: Sequence[str]) -> JobConflict:
+    return JobConflict(
+        f"The queue has no entry for job {', '.join(job_ids)}: it was deleted, or its files are damaged. Mend what its "
+        "error names and start the service again, which gives it an entry; or delete it and submit it anew."
+    )
+
+
+def _with_patience(url: str) -> str:
+    if url.startswith(_SQLITE):
+        return url
+    parts = make_url(url)
+    return parts.set(query={**PATIENCE, **parts.query}).render_as_string(hide_password=False)
+
+
+def cannot_open(url: str, error: Exception) -> JobError:
+    """What to say, without any secret, to whoever gave this URL of a database that does not open."""
+    if _is_clear(url):
+        return JobError(f"The job database{_named(url)} cannot be opened: {_why(url, error)}")
+    return JobError(
+        f"The job database{_named(url)} cannot be opened: its URL is wrong or ambiguous. Write it like "
+        "sqlite:///path or postgresql://user:password@host/database, and write @ / ? and % in a password as %40 %2F "
+        "%3F and %25"
+    )
+
+
+def no_answer(url: str, error: Exception) -> JobError:
+    """What to say while the database is away. Why goes to the log: who asks the service need not know its inside."""
+    LOG.warning("the job database%s does not answer: %s", _named(url), _why(url, error))
+    return JobError("The job database does not answer at the moment. Try again in a few seconds.")
+
+
+# A PostgreSQL URL that all drivers take apart alike. Of any other, one may take for a host or a port, and name in its
+# message, what another takes for a part of the password.
+_CODE = "%[0-9A-Fa-f]{2}"
+_CLEAR = re.compile(
+    r"postgres(?:ql)?(?:\+\w+)?://"
+    rf"(?:(?:[^:@/?%\s]|{_CODE})*(?::(?P<password>(?:[^@/?%\s]|{_CODE})*))?@)?"  # user, password
+    rf"(?:(?:[\w.-]|{_CODE})*|\[[0-9A-Fa-f:.]+\])(?::\d+)?"  # host, port
+    r"(?:/[\w.-]*)?"  # database
+    rf"(?:\?(?P<query>\w+=(?:[^@%\s]|{_CODE})*))?"
+)
+
+
+def _is_clear(url: str) -> bool:
+    return url.startswith(_SQLITE) or _CLEAR.fullmatch(url) is not None
+
+
+def _named(url: str) -> str:
+    """The part of a URL that holds no secret, to follow a noun; nothing where that is not certain."""
+    if url.startswith(_SQLITE):
+        return f" {url}"
+    scheme = re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", url)
+    return "" if scheme is None else f" {scheme[0]}…"
+
+
+def _why(url: str, error: Exception) -> str:
+    """The first line of a driver's message, without the secrets of the URL it speaks of."""
+    if not _is_clear(url):
+        return type(error).__name__
+    why = (str(error).splitlines() or [repr(error)])[0]
     for secret in _secrets(url):
-        reason = reason.replace(secret, "…")
-    return reason
+        why = re.sub(rf"(?<!\w){re.escape(secret)}(?!\w)", "…", why)
+    return why
 
 
-def _secrets(url: str) -> list[str]:
-    """Parts of what stands between the user's name and the last @, and of a password among the parameters.
-
-    Parts, because a driver takes a password with an @ or a / in it for a host or a path, and says so.
-    """
-    before, _, _ = url.rpartition("@")
-    _, _, given = before.rpartition("//")[2].partition(":")
-    texts = [given, *re.findall(r"[?&]password=([^&]*)", url)]
-    return [part for text in texts for part in re.split("[@/:?#]", text) if part]
+def _secrets(url: str) -> set[str]:
+    clear = _CLEAR.fullmatch(url)
+    if clear is None:
+        return set()
+    pairs = [pair.partition("=") for pair in (clear["query"] or "").split("&")]
+    written = {clear["password"] or "", *(value for key, _, value in pairs if "pass" in key)}
+    return {form for secret in written for form in (secret, unquote(secret)) if form}

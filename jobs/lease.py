@@ -2,7 +2,7 @@
 
 The answer comes from the kernel (`flock`, one machine) or from PostgreSQL (a session's advisory lock, many
 machines): both let go by themselves when the holder dies, so no clock and no heartbeat is involved. Knows nothing of
-jobs.
+jobs but how it is said that their database is away.
 """
 
 from __future__ import annotations
@@ -12,20 +12,25 @@ import hashlib
 import logging
 import os
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 import psycopg  # DBOS depends on it, so it is always there
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from jobs.job import JobError
+from jobs.engine import PATIENCE, cannot_open, no_answer
 
 LOG = logging.getLogger(__name__)
 
 _NAMESPACE = 0x67726169  # "grai": first key of our advisory locks, apart from everybody else's
+# How long to wait for those who ask at the same time: somewhat longer than one of them waits for a connection.
+_TURN_S = 10.0
 
 
 class Leases(Protocol):
-    """Named locks that die with their holder."""
+    """Named locks that die with their holder. Methods raise `JobError` while whoever keeps the locks is away."""
 
     def take(self, name: str) -> bool:
         """Take the lease for ourselves; False when somebody else holds it."""
@@ -117,41 +122,59 @@ class FileLeases:
 
 
 class PostgresLeases:
-    """Leases on many machines: advisory locks of one PostgreSQL session, released by the server when it ends."""
+    """Leases on many machines: advisory locks of one PostgreSQL session, released by the server when it ends.
+
+    A session that ended, as all do when the server starts again, is followed by another one that holds nothing until
+    `keep` takes it again. Safe to use from several threads.
+    """
 
     def __init__(self, url: str) -> None:
         self._url = url
         self._guard = threading.Lock()
         self._held: set[str] = set()
-        self._connection = self._connect()
+        try:
+            self._connection = self._connect()
+        except psycopg.Error as error:
+            raise cannot_open(url, error) from error
 
     def _connect(self) -> psycopg.Connection[tuple[object, ...]]:
-        # Keepalives notice within half a minute that the other machine is gone.
-        return psycopg.connect(
-            self._url,
-            autocommit=True,
-            connect_timeout=10,
-            keepalives=1,
-            keepalives_idle=10,
-            keepalives_interval=5,
-            keepalives_count=3,
-        )
-
-    def _reconnect(self) -> None:
-        """Begin a new session. The server let go of our leases with the old one."""
-        with self._guard:
-            self._connection.close()
-            self._connection = self._connect()
-            self._held.clear()
+        return psycopg.connect(make_conninfo("", **{**PATIENCE, **conninfo_to_dict(self._url)}), autocommit=True)
 
     @staticmethod
     def _key(name: str) -> int:
         return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big", signed=True)
 
     def _ask(self, query: str, *values: int) -> object:
-        with self._guard:
-            row = self._connection.execute(query.encode(), values).fetchone()
-            return row[0] if row else None
+        """The one value that a query gives, from a new session where the old one was lost. Raises `JobError`."""
+        try:
+            with self._turn():
+                try:
+                    return self._value(query, *values)
+                except psycopg.OperationalError:
+                    self._reconnect()
+                    LOG.warning("the session that holds leases was lost; another one takes its place")
+                    return self._value(query, *values)
+        except (psycopg.OperationalError, TimeoutError) as error:
+            raise no_answer(self._url, error) from error
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        # With a limit: where no connection is to be had, those who wait would otherwise wait for each other in turn.
+        if not self._guard.acquire(timeout=_TURN_S):
+            raise TimeoutError("others wait for it already")
+        try:
+            yield
+        finally:
+            self._guard.release()
+
+    def _value(self, query: str, *values: int) -> object:
+        row = self._connection.execute(query.encode(), values).fetchone()
+        return row[0] if row else None
+
+    def _reconnect(self) -> None:
+        self._connection.close()
+        self._held.clear()
+        self._connection = self._connect()
 
     def take(self, name: str) -> bool:
         taken = self._ask("select pg_try_advisory_lock(%s, %s)", _NAMESPACE, self._key(name)) is True
@@ -160,10 +183,7 @@ class PostgresLeases:
         return taken
 
     def keep(self, name: str) -> bool:
-        try:
-            self._ask("select 1")
-        except psycopg.OperationalError:
-            self._reconnect()
+        self._ask("select 1")  # a lost session has lost its locks, which nobody says unless asked
         return name in self._held or self.take(name)
 
     def take_from_the_dead(self, name: str) -> bool:
@@ -175,20 +195,12 @@ class PostgresLeases:
             self._ask("select pg_advisory_unlock(%s, %s)", _NAMESPACE, self._key(name))
 
     def alive(self) -> int:
-        """Raises `JobError` while the database is away."""
-        query = (
-            "select count(*) from pg_locks where locktype = 'advisory' and classid = %s and granted "
-            "and database = (select oid from pg_database where datname = current_database())"
+        # The view shows the locks of all databases of the server.
+        count = self._ask(
+            "select count(*) from pg_locks where locktype = 'advisory' and classid = %s and granted"
+            " and database = (select oid from pg_database where datname = current_database())",
+            _NAMESPACE,
         )
-        try:
-            count = self._ask(query, _NAMESPACE)
-        except psycopg.OperationalError as lost:
-            LOG.info("asking for leases anew: %s", lost)
-            try:
-                self._reconnect()
-                count = self._ask(query, _NAMESPACE)
-            except psycopg.OperationalError as error:
-                raise JobError("The job database does not answer. Try again later.") from error
         return int(str(count))
 
     def close(self) -> None:

@@ -18,6 +18,8 @@ from jobs.store import Store
 
 LOG = logging.getLogger(__name__)
 
+_RETRIABLE: Final = (JobState.FAILED, JobState.DIVERGED)
+
 # Stands for what was asked for where that cannot be read.
 UNREADABLE: Final = JobSpec(name="unreadable", capture="", config={})
 
@@ -88,15 +90,19 @@ class JobQueue:
         return self.get(job_id)
 
     def retry(self, job_id: str) -> Job:
-        """Queue a job that failed or diverged again; it continues from its last checkpoint, if it has one."""
+        """Queue a job that failed or diverged again; it continues from its last checkpoint, if it has one.
+
+        Of several who ask at once all get the job as it is in the queue again. Raises `JobConflict` for a job in
+        another state, and for a damaged one that the queue does not know.
+        """
         job = self.get(job_id)
-        if job.state in (JobState.FAILED, JobState.DIVERGED):
+        if job.state in _RETRIABLE:
             try:
                 self._engine.rewind(job_id)
             except JobConflict:
-                if self.get(job_id).state.final:
+                # Either somebody else put it back a moment ago, which is what was asked for, or nobody can.
+                if self.get(job_id).state in _RETRIABLE:
                     raise
-                LOG.info("job %s was queued again by somebody else", job_id)
         elif job.state is JobState.CANCELLED:
             raise JobConflict(f"Job {job_id} was cancelled, it did not fail. Use resume.")
         elif job.state is JobState.SUCCEEDED:

@@ -12,8 +12,10 @@ import logging
 import os
 import secrets
 import socket
+import sys
 import threading
 import time
+from typing import NoReturn
 
 from jobs.engine import Engine, executing
 from jobs.exit_code import OUT_OF_MEMORY, ExitCode
@@ -43,7 +45,10 @@ class Worker:
         self._leaving = False
 
     def run(self, stop: threading.Event) -> None:
-        """Work until `stop` is set; then bring all trainers to a checkpoint and give their jobs back."""
+        """Work until `stop` is set; then bring all trainers to a checkpoint and give their jobs back.
+
+        Where the database is away at that time, this ends the process, as nothing else would.
+        """
         engine = Engine(self._url)
         leases = open_leases(self._url, self._store.workers)
         if not leases.take(self.id):
@@ -53,14 +58,23 @@ class Worker:
                 LOG.info("worker %s takes jobs: %d at a time, %d threads each", self.id, self._slots, self._threads)
                 self._rounds(engine, leases, stop)
                 self._stop_all()
-            try:
-                engine.requeue([ticket.job_id for ticket in engine.running() if ticket.executor == self.id])
-            except JobError as error:
-                LOG.error("jobs of worker %s wait until another one finds its lease free: %s", self.id, error)
+            returned = self._give_back(engine)
         finally:
             leases.close()
             engine.close()
             LOG.info("worker %s has left", self.id)
+        if not returned:
+            _end_process()
+
+    def _give_back(self, engine: Engine) -> bool:
+        """Put the jobs that were still ours back in the queue; False when the database is away."""
+        try:
+            engine.requeue([ticket.job_id for ticket in engine.running() if ticket.executor == self.id])
+        except JobError as error:
+            # The lease goes with us, so that the next worker to look finds them as those of a dead one.
+            LOG.warning("worker %s leaves its jobs to others: %s", self.id, error)
+            return False
+        return True
 
     def _rounds(self, engine: Engine, leases: Leases, stop: threading.Event) -> None:
         while True:
@@ -76,8 +90,11 @@ class Worker:
                     if running.get(job_id) != self.id and not trainer.stopping:
                         LOG.warning("job %s is no longer ours: stopping its trainer", job_id)
                         trainer.stop()
-            except Exception:
+            except JobError as error:
                 # The database may be away for a while; training goes on meanwhile, and the next round asks again.
+                LOG.warning("a round of worker %s is put off: %s", self.id, error)
+            except Exception:
+                # Nobody foresaw it, but it is no reason to give up a training either.
                 LOG.exception("a round of worker %s failed", self.id)
             if stop.wait(ROUND_S):
                 return
@@ -143,6 +160,17 @@ def reap(engine: Engine, leases: Leases, own: str, running: dict[str, str | None
             engine.requeue(lost)
         finally:
             leases.release(executor)
+
+
+def _end_process() -> NoReturn:
+    """End with code 0, without waiting for threads.
+
+    DBOS has threads that ask again until the database answers, which nothing stops, and Python waits for them.
+    """
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def _outcome(ending: Ending) -> Outcome | None:

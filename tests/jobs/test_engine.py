@@ -6,12 +6,16 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from sqlalchemy import make_url
 
-from jobs.engine import Engine, executing
-from jobs.job import JobConflict, JobError, JobState, Outcome
+from jobs.engine import PATIENCE, Engine, _with_patience, cannot_open, executing, no_answer
+from jobs.job import JobConflict, JobError, JobSpec, JobState, Outcome
+from jobs.queue import JobQueue
+from jobs.store import Store
 
 LONG_S = 20.0
 
@@ -121,38 +125,73 @@ def test_leaving_stops_what_runs_and_another_worker_can_have_it(engine: Engine) 
         until(lambda: state(engine, "a") is JobState.SUCCEEDED)
 
 
-def test_a_database_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
+def test_a_database_that_cannot_be_opened_is_named_without_its_password(tmp_path: Path) -> None:
     with pytest.raises(JobError, match="nowhere"):
         Engine(f"sqlite:///{tmp_path}/nowhere/jobs.sqlite")
+    with pytest.raises(JobError) as caught:
+        Engine("postgresql://me:secret@127.0.0.1:1/none?connect_timeout=1")
+    assert "secret" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
     "url",
     [
-        "postgresql://me:secret@127.0.0.1:1/none?connect_timeout=1",
-        "postgresql://127.0.0.1:1/none?connect_timeout=1&user=me&password=secret",
-        "postgresql//me:secret@127.0.0.1",
-        "postgresql://me:other@secret@127.0.0.1:1/none",
-        "postgresql://me:other/secret@127.0.0.1:1/none",
+        "postgresql://127.0.0.1:1/none?user=me&password=geheim",
+        "postgresql://127.0.0.1:1/none?geheim",
+        "postgresql//me:geheim@h",
+        "postgresql://me:ge@heim@127.0.0.1:1/none",  # taken for a part of the host
+        "postgresql://me:ge/heim@127.0.0.1:1/none",
+        "postgresql://me:geheim",  # taken for the port
+        "mysql://me:geheim@127.0.0.1:1/none",
+        "sqlite://me:geheim@h",
+        "geheim",
     ],
 )
-def test_a_database_that_cannot_be_opened_is_named_without_its_password_of_any_form(url: str) -> None:
-    with pytest.raises(JobError) as caught:
+def test_no_part_of_a_password_is_shown_however_the_url_is_written(url: str) -> None:
+    with pytest.raises(JobError, match="cannot be opened") as caught:
         Engine(url)
-    assert "secret" not in str(caught.value)
-    assert "other" not in str(caught.value)
-    assert "postgresql" in str(caught.value)
+    assert "heim" not in str(caught.value)
 
 
-def test_who_comes_second_with_a_retry_is_told_so(engine: Engine) -> None:
-    async def fail(_: str) -> Outcome:
-        return Outcome(JobState.FAILED, "no")
+def test_what_a_driver_says_is_shown_without_the_password(caplog: pytest.LogCaptureFixture) -> None:
+    error = OSError('password authentication failed for user "me" with ge%heim, ge%25heim\nLINE 1')
+    said = str(cannot_open("postgresql://me:ge%25heim@h/none", error))
+    assert said.endswith('cannot be opened: password authentication failed for user "me" with …, …')
+    assert "h/none" not in said
+    said = str(no_answer("postgresql://me@h/none?sslpassword=geheim", OSError("geheim at h is away")))
+    assert "away" not in said  # for whoever asks over HTTP
+    assert "… at h is away" in caplog.text
 
+
+def test_waiting_for_a_database_has_limits_which_its_url_can_change() -> None:
+    url = make_url(_with_patience("postgresql://me:a%40b@h/none?connect_timeout=9&options=-c%20x%3D1"))
+    assert (url.password, url.query["options"]) == ("a@b", "-c x=1")
+    assert url.query == {**PATIENCE, "connect_timeout": "9", "options": "-c x=1"}
+
+
+def test_a_job_that_is_not_at_its_end_or_unknown_cannot_be_rewound_nor_an_unknown_one_requeued(engine: Engine) -> None:
     engine.enqueue("a", 10)
-    with executing(engine.url, "worker-a", 1, fail):
-        until(lambda: state(engine, "a") is JobState.FAILED)
-    engine.rewind("a")
-    with pytest.raises(JobConflict, match="queued again meanwhile"):
+    with pytest.raises(JobConflict, match="changed its state"):
         engine.rewind("a")
-    with pytest.raises(JobConflict, match="submit a new one"):
-        engine.rewind("of another queue")
+    for put_back in (engine.rewind, lambda job_id: engine.requeue(["a", job_id])):
+        with pytest.raises(JobConflict, match=r"no entry for job .*b"):
+            put_back("b")
+
+
+def test_of_several_who_retry_a_job_at_once_all_find_it_in_the_queue(tmp_path: Path, engine: Engine) -> None:
+    async def run(job_id: str) -> Outcome:
+        return Outcome(JobState.FAILED, "on purpose")
+
+    jobs = JobQueue(Store(tmp_path / "data"), engine)
+    (tmp_path / "capture").mkdir()
+    job_id = jobs.submit(JobSpec("a", "0" * 64, {}), tmp_path / "capture").id
+    with executing(engine.url, "worker-a", 1, run):
+        until(lambda: jobs.get(job_id).state is JobState.FAILED)
+    together = threading.Barrier(8)
+
+    def retry(_: int) -> JobState:
+        together.wait(LONG_S)
+        return jobs.retry(job_id).state
+
+    with ThreadPoolExecutor(8) as pool:
+        assert set(pool.map(retry, range(8))) == {JobState.QUEUED}

@@ -58,6 +58,9 @@ def test_a_service_starts_with_damaged_jobs_and_strange_files(settings: Settings
     with TestClient(create_app(settings)) as client:
         states = {one["id"]: one["state"] for one in client.get("/jobs").json()["jobs"]}
         assert states == {damaged: "failed", whole: "queued"}
+        refused = client.post(f"/jobs/{damaged}/retry")
+        assert refused.status_code == 409
+        assert "delete it" in refused.json()["detail"]
         assert client.delete(f"/jobs/{damaged}").status_code == 204
 
 

@@ -1,0 +1,48 @@
+"""The service while its PostgreSQL is away: what needs it says so at once, everything else is served."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.settings import Settings
+from tests.jobs.test_postgres import Server, serving
+from tests.service.test_jobs import problem
+
+pytestmark = pytest.mark.slow
+
+# More than the service has threads.
+MANY = 60
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory) as server:
+        yield server
+
+
+@pytest.fixture
+def settings(settings: Settings, server: Server) -> Settings:
+    return settings.model_copy(update={"database": server.url})
+
+
+def test_the_service_is_ready_again_after_a_restart_of_the_database(client: TestClient, server: Server) -> None:
+    assert client.get("/readyz").status_code == 200
+    with server.away():
+        answer = client.get("/readyz")
+        assert "does not answer" in problem(answer, 503)["detail"]
+        assert answer.headers["retry-after"] == "5"
+        assert str(server.port) not in answer.text
+    assert client.get("/readyz").json()["ready"]
+
+
+def test_requests_that_need_the_database_do_not_keep_the_others_waiting(client: TestClient, server: Server) -> None:
+    assert client.get("/jobs").json()["jobs"] == []
+    with ThreadPoolExecutor(MANY) as pool, server.away():
+        answers = [pool.submit(client.get, f"/jobs/{number:016x}") for number in range(MANY)]
+        assert pool.submit(client.get, "/options").result(20).status_code == 200
+        assert {answer.result(20).status_code for answer in answers} == {503}
+    assert client.get(f"/jobs/{0:016x}").status_code == 404
