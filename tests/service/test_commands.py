@@ -46,7 +46,7 @@ def test_an_interrupted_service_takes_its_worker_along(tmp_path: Path, number: s
 
 @pytest.mark.parametrize(
     ("options", "word"),
-    [(["--data", f"{__file__}/below"], "below"), (["--database", "foo://bar"], "foo")],
+    [(["--data", f"{__file__}/below"], "below"), (["--database", "foo://bar"], "foo://")],
 )
 def test_a_service_that_cannot_open_its_data_says_so_in_one_line(tmp_path: Path, options: list[str], word: str) -> None:
     command = [sys.executable, "-m", "service.commands", "--port", "0", "--data", str(tmp_path), *options]
