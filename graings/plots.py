@@ -179,7 +179,7 @@ def _reached(entry: Mapping[str, Any]) -> str:
 
 
 def _seconds(part: Mapping[str, Any], y: float) -> list[str]:
-    """A bar of the whole clock, and in words what is not training; a mismatch is said in its place."""
+    """A bar of the whole clock, and in words what is not training and what processors did, or what does not add up."""
     spent, totals = part["phases"], part["totals"]
     named = {
         "train": totals["train_s"],
@@ -195,5 +195,8 @@ def _seconds(part: Mapping[str, Any], y: float) -> list[str]:
         x += width
     said = [f"{kind} {duration(seconds)}" for kind, seconds in named.items()]
     parts += [text(BAR, y + 13, " · ".join(said[:2])), text(BAR, y + 27, " · ".join(said[2:]))]
-    parts += [text(BAR, y + 41, "the phases do not add up", "warning")] if spent["problems"] else []
+    if spent["problems"]:
+        parts.append(text(BAR, y + 41, "the phases do not add up", "warning"))
+    elif totals["train_cpu_s"] is not None:
+        parts.append(text(BAR, y + 41, f"train, all processors {duration(totals['train_cpu_s'])}"))
     return parts

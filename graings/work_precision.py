@@ -33,7 +33,7 @@ QUANTISATION_RMSE: Final = 1 / (255 * math.sqrt(12))
 POINT_KEYS: Final = ("iteration", "train_s", "total_s", "psnr", "rmse", "ssim_3dgs", "views", "gaussians", "anchors")
 
 # What runs of earlier versions did not measure: null there.
-LATER_POINT_KEYS: Final = ("step_over_size", "subpixel_share")
+LATER_POINT_KEYS: Final = ("train_cpu_s", "step_over_size", "subpixel_share")
 
 _KEYS: Final = (
     *("splits", "train_s", "total_s", "phases_s", "iterations", "gaussians", "anchors", "bytes", "curve", "events"),
@@ -108,6 +108,7 @@ def training_part(name: str, metrics: Mapping[str, Any], run: Mapping[str, Any] 
         "phases": spent,
         "totals": {
             "train_s": metrics["train_s"],
+            "train_cpu_s": metrics.get("train_cpu_s"),
             "evaluation_s": metrics["phases_s"].get("evaluation", 0.0),
             "checkpoint_s": metrics["phases_s"].get("checkpoint", 0.0),
             "total_s": spent["total_s"],
@@ -222,7 +223,9 @@ def summary(part: Mapping[str, Any]) -> str:
     reached = [entry for entry in part["time_to_psnr"] if entry["train_s"] is not None]
     times = ", ".join(f"{entry['target_db']:g} dB {duration(entry['train_s'])}" for entry in reached)
     ending = f"; time to {times}" if times else ""
-    return f"{name}: {last['psnr']:.2f} dB after {duration(last['train_s'])} of training{ending}"
+    computed = part["totals"]["train_cpu_s"]
+    processors = "" if computed is None else f" ({duration(computed)} of processor)"
+    return f"{name}: {last['psnr']:.2f} dB after {duration(last['train_s'])} of training{processors}{ending}"
 
 
 def _final(split: Mapping[str, Any]) -> dict[str, Any]:

@@ -100,6 +100,21 @@ def test_the_clock_on_the_wall_sees_what_nobody_booked(monkeypatch: pytest.Monke
     assert (clock.wall_s(), clock.total_s(), clock.train_s()) == (8.0, 6.0, 4.0)
 
 
+def test_processor_time_stands_beside_the_training_time_and_is_unknown_of_earlier_runs() -> None:
+    known, unknown = part("new", point(1, 25.0), train_cpu_s=150.0), part("old", point(1, 25.0))
+    assert (known["totals"]["train_cpu_s"], unknown["totals"]["train_cpu_s"]) == (150.0, None)
+    assert "after 1 s of training (2.5 min of processor)" in summary(known)
+    assert summary(unknown).endswith("after 1 s of training")
+
+
+def test_a_clock_that_earlier_versions_began_does_not_know_all_processor_time() -> None:
+    clock, whole = Clock({"joint": 4.0}, 5.0, None), Clock()
+    for one in (clock, whole):
+        one.add("joint", 1.0, 1.5)
+        one.add("joint", 1.0, 2.0)
+    assert (clock.train_cpu_s, whole.train_cpu_s) == (None, 3.5)
+
+
 def test_evaluation_and_checkpoints_stand_beside_the_training_time() -> None:
     totals = part("run", point(1, 25.0))["totals"]
     assert (totals["train_s"], totals["evaluation_s"], totals["checkpoint_s"]) == (80.0, 12.0, 7.0)

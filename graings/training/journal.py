@@ -36,10 +36,11 @@ FPS_VIEWS = 8
 
 @dataclass(frozen=True, slots=True)
 class EvaluationPoint:
-    """Held-out quality at one moment of training; `train_s` excludes evaluation and checkpoints."""
+    """Held-out quality at one moment of training; `train_s` and `train_cpu_s` exclude evaluation and checkpoints."""
 
     iteration: int
     train_s: float
+    train_cpu_s: float | None
     psnr: float
     rmse: float
     ssim_3dgs: float
@@ -76,6 +77,7 @@ class Journal:
         point = EvaluationPoint(
             iteration=iteration,
             train_s=self.clock.train_s(),
+            train_cpu_s=self.clock.train_cpu_s,
             psnr=metrics.psnr,
             rmse=math.sqrt(sum(view.mse for view in metrics.views) / len(metrics.views)),
             ssim_3dgs=metrics.ssim_3dgs,
@@ -93,6 +95,7 @@ class Journal:
         return {
             "seconds": self.clock.seconds,
             "wall_s": self.clock.wall_s(),
+            "train_cpu_s": self.clock.train_cpu_s,
             "curve": self.curve,
             "events": self.events,
             "gaussians": self.gaussians,
@@ -101,7 +104,7 @@ class Journal:
     def load(self, state: dict[str, Any]) -> None:
         """Continue from what `state()` gave."""
         seconds = dict(state["seconds"])
-        self.clock = Clock(seconds, state.get("wall_s", sum(seconds.values())))
+        self.clock = Clock(seconds, state.get("wall_s", sum(seconds.values())), state.get("train_cpu_s"))
         self.curve = list(state["curve"])
         self.events = list(state["events"])
         self.gaussians = int(state["gaussians"])
@@ -149,6 +152,7 @@ class Journal:
             "schema": METRICS_SCHEMA,
             "splits": splits,
             "train_s": self.clock.train_s(),
+            "train_cpu_s": self.clock.train_cpu_s,
             "total_s": self.clock.total_s(),
             "wall_s": self.clock.wall_s(),
             "phases_s": dict(self.clock.seconds),

@@ -20,16 +20,23 @@ class Clock:
     """Seconds per phase; training, evaluation and saving never share a second.
 
     The wall clock beside them starts with the object, after the `before_s` of earlier sittings: what nobody booked
-    shows as a difference.
+    shows as a difference. `train_cpu_s` is what all threads of the process computed while training, which a busy or
+    halted machine does not change much; None where an earlier version trained a part of the run and did not look.
     """
 
     seconds: dict[str, float] = field(default_factory=dict)
     before_s: float = 0.0
+    train_cpu_s: float | None = 0.0
     _started: float = field(default_factory=time.perf_counter)
 
-    def add(self, phase: str, seconds: float) -> None:
-        """Book `seconds` on a phase of training or on load, evaluation or checkpoint."""
+    def add(self, phase: str, seconds: float, cpu_s: float = 0.0) -> None:
+        """Book `seconds` on a phase of training or on load, evaluation or checkpoint.
+
+        `cpu_s` are the seconds of processors that a phase of training took.
+        """
         self.seconds[phase] = self.seconds.get(phase, 0.0) + seconds
+        if self.train_cpu_s is not None:
+            self.train_cpu_s += cpu_s
 
     def train_s(self) -> float:
         """Seconds of training alone."""

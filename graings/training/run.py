@@ -64,9 +64,9 @@ class TrainingRun:
         self.applied = self.plan.apply(config)
         self.images = ImageStore(config.capture.background_rgb(), config.capture.cache_mb)
         self._journal = Journal(folder, capture, config, self.plan, clock)
-        started = time.perf_counter()
+        started, computed = time.perf_counter(), time.process_time()
         self._trainer = Trainer(capture, self.images, self.applied)
-        clock.add("init", time.perf_counter() - started)
+        clock.add("init", time.perf_counter() - started, time.process_time() - computed)
         self._best_psnr: float | None = None
 
     @classmethod
@@ -144,7 +144,7 @@ class TrainingRun:
         due = evaluation_marks(self.config)
         rate = Rate()
         for step in self._trainer:
-            self._journal.clock.add(step.phase, step.seconds)
+            self._journal.clock.add(step.phase, step.seconds, step.cpu_s)
             self._journal.gaussians = step.gaussians
             rate.add(step.seconds)
             self._journal.note(self.iteration, step.events)

@@ -68,7 +68,8 @@ def phases(config: TrainConfig) -> tuple[Phase, ...]:
 class StepReport:
     """One step: what it did and what it cost.
 
-    `psnr`, in dB, is the mean of the training views just drawn; `gaussians` is how many any of them drew.
+    `psnr`, in dB, is the mean of the training views just drawn; `gaussians` is how many any of them drew. `seconds` are
+    those on the wall, `cpu_s` those that the threads of this process computed.
     """
 
     iteration: int
@@ -79,6 +80,7 @@ class StepReport:
     gaussians: int
     anchors: int
     seconds: float
+    cpu_s: float
     events: tuple[str, ...] = ()
 
 
@@ -121,7 +123,7 @@ class Trainer:
 
     def step(self) -> StepReport:
         """Take one step. Raises `DivergedError` when training went wrong once more than it may go back."""
-        started = time.perf_counter()
+        started, computed = time.perf_counter(), time.process_time()
         if len(self.snapshots) == 0:
             self._take_snapshot()  # the beginning, or the checkpoint that training goes on from
         self.iteration += 1
@@ -188,6 +190,7 @@ class Trainer:
             gaussians=len(children),
             anchors=self.scene.scaffold.count,
             seconds=time.perf_counter() - started,
+            cpu_s=time.process_time() - computed,
             events=tuple(events),
         )
 

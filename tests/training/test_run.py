@@ -17,6 +17,7 @@ from graings.config import SHAPE_BEFORE, TrainConfig, make_config
 from graings.errors import CheckpointError
 from graings.evaluation import evaluate, evaluate_run
 from graings.metrics import SplitMetrics
+from graings.raster.photometric import photometric
 from graings.training.run import TrainingRun
 
 ITERATIONS = 60
@@ -106,6 +107,27 @@ def test_a_slow_evaluation_costs_total_time_and_no_training_time(
     assert part["run"]["status"] == "finished"
     assert len(part["points"]) == len(document["curve"])
     assert (tmp_path / "run" / "report" / "training.svg").exists()
+
+
+def test_a_halted_machine_costs_training_time_and_no_processor_time(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept = 0.0
+
+    def slowly(*arguments: Any) -> torch.Tensor:
+        nonlocal slept
+        slept += 0.1
+        time.sleep(0.1)
+        return photometric(*arguments)
+
+    monkeypatch.setattr("graings.training.trainer.photometric", slowly)
+    list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=10, threads=1)))
+    document = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert document["train_s"] >= slept
+    assert 0 < document["train_cpu_s"] <= document["train_s"] - 0.9 * slept
+    points = document["curve"]
+    assert [point["train_cpu_s"] for point in points] == sorted(point["train_cpu_s"] for point in points)
+    assert points[-1]["train_cpu_s"] <= document["train_cpu_s"]
 
 
 def _refuse(constant: str) -> float:
