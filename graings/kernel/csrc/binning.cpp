@@ -134,8 +134,12 @@ void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next)
                 __builtin_prefetch(pair + 4, 1);  // where this tile's next ones go
                 *pair = {depth, id, place, mask}, to += there;
             };
-            put(at[0], 1, begin, first_columns & first_rows), put(at[1], columns, begin + 1, right & first_rows);
-            put(at[across_], rows, begin + columns + 1, first_columns & bottom), put(at[across_ + 1], columns & rows, begin + 3, right & bottom);
+            put(at[0], 1, begin, first_columns & first_rows);
+            if (columns & rows) {  // a quarter of them: rarer than what the other two would cost for nothing
+                put(at[1], 1, begin + 1, right & first_rows);
+                put(at[across_], 1, begin + 2, first_columns & bottom), put(at[across_ + 1], 1, begin + 3, right & bottom);
+            } else
+                put(at[columns ? 1 : across_], columns | rows, begin + 1, columns ? right & first_rows : first_columns & bottom);
             continue;
         }
         uint32_t place = begin;

@@ -6,6 +6,15 @@
 
 namespace graings::GRAINGS_ISA {
 
+// Sums that fill a cache line go past the caches: nobody reads them before all tiles are done, and a line that is
+// written whole need not be fetched first.
+#if defined(__AVX512F__)
+static_assert(kSumStride * sizeof(float) == 64);
+template <class R> constexpr bool kStreamed = sizeof(R) == 4;
+#else
+template <class R> constexpr bool kStreamed = false;
+#endif
+
 // out[q] = sum of the 16 numbers of v[q], for all sums of an entry at once; writes up to kSumStride numbers.
 template <class R>
 GRAINGS_INLINE void add_lanes(const P<R> (&v)[kSums], R* out) {
@@ -19,7 +28,7 @@ GRAINGS_INLINE void add_lanes(const P<R> (&v)[kSums], R* out) {
         const __m512 two = quarters(of(8), of(9)), rest = quarters(two, two);
         const __m512 by_four = pairs(pairs(four(0), four(4)), pairs(rest, rest));  // sum q at 4 (q % 4) + q / 4
         const __m512i place = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-        _mm512_storeu_ps(out, _mm512_permutexvar_ps(place, by_four));
+        _mm512_stream_ps(out, _mm512_permutexvar_ps(place, by_four));
         return;
     }
 #elif defined(__AVX2__)
@@ -179,7 +188,7 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     for (int j = n - 1; j >= 0; j--) {
         if (j >= kRecordAhead) __builtin_prefetch(&record_of(j - kRecordAhead));
         if (j >= kReadyAhead) make_ready(j - kReadyAhead);
-        if (j >= kSumsAhead) __builtin_prefetch(sums_of(j - kSumsAhead), 1);
+        if (!kStreamed<R> && j >= kSumsAhead) __builtin_prefetch(sums_of(j - kSumsAhead), 1);
         uint32_t mask = entries[j].mask & heard;
         all.written[entries[j].place] = mask != 0;
         if (!mask) continue;
@@ -200,6 +209,9 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         }
     }
     if (open >= 0) close();
+#if defined(__AVX512F__)
+    if constexpr (kStreamed<R>) _mm_sfence();  // before another thread learns that this tile is done
+#endif
 }
 
 template <class R>

@@ -59,6 +59,23 @@ GRAINGS_INLINE void by_block(const uint16_t (&masks)[kChunk], uint64_t (&entries
 #endif
 }
 
+// masks[j]: which blocks have entry j in their list.
+GRAINGS_INLINE void by_entry(const uint64_t (&entries)[kBlocks], uint16_t (&masks)[kChunk]) {
+#if defined(__AVX512BW__)
+    __m512i low = _mm512_setzero_si512(), high = low;
+    for (int b = 0; b < kBlocks; b++) {
+        const __m512i bit = _mm512_set1_epi16(short(1 << b));
+        low = _mm512_mask_add_epi16(low, __mmask32(entries[b]), low, bit);
+        high = _mm512_mask_add_epi16(high, __mmask32(entries[b] >> 32), high, bit);
+    }
+    _mm512_storeu_si512(masks, low), _mm512_storeu_si512(masks + 32, high);
+#else
+    std::memset(masks, 0, sizeof masks);
+    for (int b = 0; b < kBlocks; b++)
+        for (int j = 0; j < kChunk; j++) masks[j] |= uint16_t((entries[b] >> j & 1) << b);
+#endif
+}
+
 template <class R> struct Distance { P<R> r, s; };
 
 template <class R>
@@ -108,7 +125,11 @@ GRAINGS_INLINE uint32_t open_lanes(const TileBox& box, R (*open)[kLanes]) {
 
 // One step of light through a pixel. `light` is what still passes; a pixel below transmittance_min has stopped and
 // keeps it. In compat the entry that would cross is left out, and `open` remembers that the pixel has stopped.
-template <class R> struct Step { P<R> weight; Mask<R, kLanes> counts; };  // of the entry; whether the pixel had not stopped
+template <class R> struct Step {
+    P<R> weight;             // of the entry
+    Mask<R, kLanes> counts;  // whether the pixel had not stopped
+    Mask<R, kLanes> seen;    // and whether it sees anything of the entry
+};
 
 template <class R, bool Compat>
 GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& open) {
@@ -120,14 +141,14 @@ GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& o
         const auto counts = zero < open;
         const P<R> weight = select(counts, alpha * light, zero);
         light = select(counts, next, light);
-        return {weight, counts};
+        return {weight, counts, counts & drawn};
     } else {
         // what waits for the entry before is kept short: one comparison and one product
         const P<R> alpha = select(drawn, capped, zero), passed = p16(R(1)) - alpha;
         const auto counts = stop <= light;
         const P<R> weight = select(counts, alpha * light, zero);
         light = select(counts, light * passed, light);
-        return {weight, counts};
+        return {weight, counts, counts & drawn};
     }
 }
 
@@ -150,6 +171,8 @@ GRAINGS_INLINE void to_rows(const R (*blocks)[kBlocks][kLanes], const TileBox& b
     }
 }
 
+constexpr int kSmall = 3;  // blocks an entry
+
 template <class R, bool Compat, bool Keep, bool Depth>
 GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
     const TileBox box = tile_box(args.camera, tile);
@@ -169,6 +192,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
         const int n = int(end - k < kChunk ? end - k : kChunk);
         uint16_t masks[kChunk] = {};
         uint64_t lists[kBlocks];
+        int touched = 0;  // blocks, by all entries
         for (int j = 0; j < n; j++) {
             Pair& pair = args.pairs[k + j];
             if (k + j + kChunk < pairs) __builtin_prefetch(&args.records[args.pairs[k + j + kChunk].id]);  // maybe the next tile's
@@ -177,11 +201,12 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
                 if constexpr (!Compat) pair.mask &= reached_blocks(chunk[j]);
             }
             masks[j] = uint16_t(pair.mask);
-            items += __builtin_popcount(pair.mask);
+            touched += __builtin_popcount(pair.mask);
         }
+        items += touched;
         by_block(masks, lists);
-        for (int b = 0; b < kBlocks; b++) {
-            if (lists[b] == 0) continue;
+        const auto walk = [&](int b, auto watch) {
+            [[maybe_unused]] uint64_t unseen = 0;  // entries of which no pixel of the block sees anything
             P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]);
             [[maybe_unused]] P<R> latest = Keep ? load<kLanes>(last[b]) : t;
             P<R> red = load<kLanes>(channels[0][b]), green = load<kLanes>(channels[1][b]);
@@ -198,10 +223,11 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
                 const TileEntry<R>& entry = chunk[j];
                 rest = list & (list - 1);
                 const P<R> next = rest ? first_of(rest) : raw;
-                const auto [weight, counts] = blend<R, Compat>(raw, limits, t, going);
+                const auto [weight, counts, seen] = blend<R, Compat>(raw, limits, t, going);
                 if (!any(counts)) break;
                 raw = next;
                 if constexpr (Keep) latest = select(counts, p16(entry.number), latest);
+                if constexpr (watch) unseen |= uint64_t(!any(seen)) << j;
                 red = fma(weight, p16(entry.look.red), red);
                 green = fma(weight, p16(entry.look.green), green);
                 blue = fma(weight, p16(entry.look.blue), blue);
@@ -211,11 +237,22 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
             if constexpr (Keep) store(last[b], latest);
             store(channels[0][b], red), store(channels[1][b], green), store(channels[2][b], blue);
             if constexpr (Depth) store(channels[3][b], depth);
-            if (any(Compat ? p16(R(0)) < going : p16(limits.transmittance_min) <= t)) continue;
+            if constexpr (watch) lists[b] &= ~(unseen | list);
+            if (any(Compat ? p16(R(0)) < going : p16(limits.transmittance_min) <= t)) return;
             live &= ~(1u << b);  // all its pixels have stopped: the gradient need not look at the rest
             items -= __builtin_popcountll(list);
             for (; list; list &= list - 1) args.pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);
-        }
+        };
+        // Of what is small many a block has nothing to show. Watching for it costs less than the way back through it.
+        constexpr bool kWatch = Keep && kOne<R, kLanes>;
+        if (kWatch && touched < kSmall * n) {
+            for (int b = 0; b < kBlocks; b++)
+                if (lists[b]) walk(b, std::true_type());
+            by_entry(lists, masks);
+            for (int j = 0; j < n; j++) args.pairs[k + j].mask = masks[j];
+        } else
+            for (int b = 0; b < kBlocks; b++)
+                if (lists[b]) walk(b, std::false_type());
         k += n;
     }
     args.processed[tile] = int32_t(k - start);

@@ -102,7 +102,7 @@ struct TileArgs {
     const R* background;
     const Record<R>* records;
     const int64_t* begin;
-    Pair* pairs;          // masks: what the entry touches and was still open, once drawn
+    Pair* pairs;          // masks: once drawn, the blocks that were still open, less those found to show nothing of it
     int32_t* processed;   // entries per tile that were looked at before every pixel had stopped
     int32_t* items;       // (entry, block) pairs per tile
     R *light, *last;      // [tile, block, lane] for the gradient, or null: what passes all entries, and the number of
