@@ -294,6 +294,13 @@ MUTANTS = (
         "",
     ),
     Mutant(
+        "next-unseen",
+        "the next entry left out on the way back for one that shows nothing",
+        TILES,
+        "unseen |= uint64_t(!any(seen)) << j;",
+        "unseen |= uint64_t(!any(seen)) << (j + 1) % kChunk;",
+    ),
+    Mutant(
         "dead-block",
         "entries forgotten in all blocks where one block has stopped",
         TILES,

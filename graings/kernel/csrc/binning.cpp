@@ -161,43 +161,38 @@ void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next)
 
 template <class R>
 void Binning<R>::sort() {
-    std::vector<Scratch> scratch{size_t(threads_)};
+    std::vector<std::vector<Pair>> halves{size_t(threads_)};
     each_tile(threads_, tiles_, [&](int worker, int64_t tile) {
         const int64_t first = begin[size_t(tile)];
-        sort(pairs.get() + first, begin[size_t(tile) + 1] - first, scratch[size_t(worker)]);
+        sort(pairs.get() + first, begin[size_t(tile) + 1] - first, halves[size_t(worker)]);
     });
 }
 
 // By the leading bits of the key in two passes, as many bits as leave few neighbours equal; then those by comparison.
+// `half` holds what the first pass has sorted.
 template <class R>
-void Binning<R>::sort(Pair* pairs, int64_t count, Scratch& scratch) const {
+void Binning<R>::sort(Pair* pairs, int64_t count, std::vector<Pair>& half) const {
     const auto before = [&](const Pair& a, const Pair& b) {
         if (a.key != b.key) return a.key < b.key;
         return std::tuple(depths_[a.id], uids_[a.id], a.id) < std::tuple(depths_[b.id], uids_[b.id], b.id);
     };
     if (count > kFew) {
-        if (int64_t(scratch.whole.size()) < count) scratch.whole.resize(size_t(2 * count)), scratch.half.resize(size_t(2 * count));
-        Pair* from = scratch.whole.data();
-        std::copy(pairs, pairs + count, from);
+        if (int64_t(half.size()) < count) half.resize(size_t(2 * count));
         uint32_t least = ~uint32_t(0), most = 0;
-        for (int64_t i = 0; i < count; i++) least = std::min(least, from[i].key), most = std::max(most, from[i].key);
+        for (int64_t i = 0; i < count; i++) least = std::min(least, pairs[i].key), most = std::max(most, pairs[i].key);
         const int digit = std::min(int(std::bit_width(uint64_t(count))) - 1, kLongestDigit), bins = 1 << digit;
         const int shift = std::max(int(std::bit_width(most - least)) - 2 * digit, 0);
         const auto lead = [&](uint32_t key) { return (key - least) >> shift; };
         uint32_t low[1 << kLongestDigit], high[1 << kLongestDigit];
         std::fill_n(low, bins, 0), std::fill_n(high, bins, 0);
         for (int64_t i = 0; i < count; i++) {
-            const uint32_t l = lead(from[i].key);
+            const uint32_t l = lead(pairs[i].key);
             low[l & (bins - 1)]++, high[l >> digit]++;
         }
         uint32_t low_total = 0, high_total = 0;
         for (int bin = 0; bin < bins; bin++) low_total += std::exchange(low[bin], low_total), high_total += std::exchange(high[bin], high_total);
-        auto* half = scratch.half.data();
-        for (int64_t i = 0; i < count; i++) {
-            const uint32_t l = lead(from[i].key);
-            half[low[l & (bins - 1)]++] = {l >> digit, uint32_t(i)};
-        }
-        for (int64_t i = 0; i < count; i++) pairs[high[half[i].first]++] = from[half[i].second];
+        for (int64_t i = 0; i < count; i++) half[low[lead(pairs[i].key) & (bins - 1)]++] = pairs[i];
+        for (int64_t i = 0; i < count; i++) pairs[high[lead(half[size_t(i)].key) >> digit]++] = half[size_t(i)];
     }
     int64_t moves = 16 * count;  // more are left to a sort that takes n log n whatever comes
     for (int64_t i = 1; i < count; i++) {

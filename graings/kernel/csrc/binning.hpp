@@ -3,7 +3,6 @@
 #pragma once
 #include <algorithm>
 #include <array>
-#include <utility>
 #include <vector>
 #include "buffer.hpp"
 #include "pool.hpp"
@@ -51,12 +50,8 @@ public:
     Buffer<int64_t> begin;  // of each tile's pairs; one more at the end
 
 private:
-    struct Scratch {
-        std::vector<std::pair<uint32_t, uint32_t>> half;  // what is left of the key, and whose
-        std::vector<Pair> whole;
-    };
     void enter(const Piece&, uint32_t place, uint32_t* next);
-    void sort(Pair* pairs, int64_t count, Scratch&) const;
+    void sort(Pair* pairs, int64_t count, std::vector<Pair>& half) const;
     uint32_t key(int64_t id) const;
 
     int64_t across_, tiles_, width_;

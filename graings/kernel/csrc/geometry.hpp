@@ -198,8 +198,7 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
             store(sums[lane], total.first), store(sums[lane] + kGroup, total.rest);
         }
         const D none[4] = {d8(0), d8(0), d8(0), d8(0)};
-        // as a function it would get all its columns through memory
-        const auto put = [&](const D* means, const D* quats, const D* log_scales, const D* opacity, const D* colors, const D* offset) __attribute__((always_inline)) {
+        const auto put = [&](const D* means, const D* quats, const D* log_scales, const D* opacity, const D* colors, const D* offset) {
             store_columns<3>(args.v_means, group, end, means), store_columns<4>(args.v_quats, group, end, quats);
             store_columns<3>(args.v_log_scales, group, end, log_scales), store_columns<1>(args.v_opacities, group, end, opacity);
             store_columns<3>(args.v_colors, group, end, colors);
