@@ -171,7 +171,7 @@ GRAINGS_INLINE void to_rows(const R (*blocks)[kBlocks][kLanes], const TileBox& b
     }
 }
 
-constexpr int kSmall = 3;  // blocks an entry
+constexpr int kSmall = 3;  // entries that touch fewer blocks, on average, are small
 
 template <class R, bool Compat, bool Keep, bool Depth>
 GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
