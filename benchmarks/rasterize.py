@@ -13,13 +13,16 @@ The two are timed in turn, so that a busy neighbour hits both: a pause, a call t
 yardstick runs in a process of its own, because both would otherwise share the threads of one OpenMP library, which
 keep a core busy long after a call.
 
-Prints median (minimum) in ms, the ratio of the medians, and the memory that one forward + backward takes at its peak.
+Prints median (minimum) in ms, the ratio of the medians, and the memory that one forward + backward takes at its peak
+beyond its inputs: images, upstream and gradients count, and nothing freed before is at hand.
+`backward_given` is forward + backward for an upstream made beforehand: what threads can share.
 `--oracle` adds the plain torch oracle (slow).
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import statistics
 import subprocess
@@ -60,6 +63,7 @@ class Ours:
         self.target = torch.from_numpy(scene.target)
         self.draw = draw
         self.image = self.result().color.detach()
+        self.given = self.upstream(self.image)
 
     def result(self, *, depth: bool = False) -> RenderResult:
         return self.draw(self.gaussians, self.camera, self.background, depth=depth)
@@ -71,6 +75,9 @@ class Ours:
     def forward_backward(self) -> None:
         color = self.result().color
         torch.autograd.grad(color, list(self.leaves.values()), self.upstream(color))
+
+    def backward_given(self) -> None:
+        torch.autograd.grad(self.result().color, list(self.leaves.values()), self.given)
 
     def forward_backward_depth(self) -> None:
         result = self.result(depth=True)
@@ -161,8 +168,10 @@ def measure_memory(folder: Path, name: str) -> float:
     """What `peak_mb` asks of its process."""
     scene = scenes.named(name, folder)
     ours = Ours(scene)
-    del ours.image
+    del ours.image, ours.given
     Ours(scenes.named("100/16", folder)).forward_backward()  # libraries come in
+    if hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+        libc.malloc_trim(0)  # what was freed would hide what is asked for
     before = _status_kb("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
     ours.forward_backward()
@@ -183,7 +192,7 @@ def measured(name: str, threads: int, options: argparse.Namespace) -> list[dict[
     if scenes.module_of(options.yardstick, "limit_kernel") is not None:
         yardstick = Yardstick(options.yardstick, name, threads)
     rows: list[dict[str, object]] = []
-    passes = ["forward", "forward_backward", "forward_backward_depth", "photometric_gradient"]
+    passes = ["forward", "forward_backward", "backward_given", "forward_backward_depth", "photometric_gradient"]
     for part in passes + ["oracle"] * options.oracle:
         calls = {"ours": ours.timed(part) if part != "oracle" else Ours(scene, reference.rasterize).timed(passes[1])}
         if yardstick is not None and part in ("forward", "forward_backward"):
