@@ -33,6 +33,7 @@ SHAPE_BEFORE: Final[dict[str, Any]] = {
     "direction_degree": 1,
     "head_width": 32,
     "reflection": False,
+    "blur": 0.3,
 }
 
 
@@ -101,6 +102,13 @@ class SceneConfig(Part):
         description="Let the colour head also see the viewing direction mirrored at a normal that it reads from the "
         "feature: where a highlight lies.",
     )
+    blur: float = Field(
+        0.1,
+        ge=0,
+        le=10,
+        description="Low-pass of the picture: variance in px^2 added to every footprint. A pixel's own box has 1/12; "
+        "3DGS and the rasterizer's default are 0.3.",
+    )
     opacity_view: bool = Field(False, description="Feed the viewing direction to the opacity head, as the paper does.")
     projected_clip: bool = Field(True, description="Let clipped values receive gradients that point back inside.")
 
@@ -122,6 +130,12 @@ class LossConfig(Part):
     """Weights of Eq. 14-18 and of rigidity; the l_* switches are for ablations. Owner: `graings.training.losses`."""
 
     ssim: float = Field(0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss.")
+    squared: float = Field(
+        10.0,
+        ge=0,
+        description="Weight of the mean squared error, which joins the photometric loss after the last growth. Not in "
+        "the paper: what few views show, as a highlight, absolute differences outvote.",
+    )
     temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
     deformation: float = Field(0.001, ge=0, description="lambda_2, magnitude of the deformation.")
     residual: float = Field(0.01, ge=0, description="lambda_3, magnitude of the appearance residual.")
@@ -330,7 +344,7 @@ def restored_training(values: Any, source: Path) -> TrainConfig:
     if isinstance(values, dict):
         before = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS, "time_window": 1.0, "batch": 1}
         values = before | values
-        for part, earlier in (("loss", {"rigidity": 0.0}), ("scene", SHAPE_BEFORE)):
+        for part, earlier in (("loss", {"rigidity": 0.0, "squared": 0.0}), ("scene", SHAPE_BEFORE)):
             if isinstance(values.get(part), dict):
                 values[part] = earlier | values[part]
     return restored(TrainConfig, values, source)

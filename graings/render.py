@@ -7,6 +7,7 @@ nothing of images on disk, losses or HTTP.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from graings.camera import Camera
 from graings.raster.rasterize import rasterize
-from graings.raster.result import RasterSettings, RenderResult
+from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from graings.scene.scene import Composition, Scene
 
 
@@ -39,13 +40,16 @@ def draw(
     means2d_offset: Float[Tensor, "gaussian 2"] | None = None,
     settings: RasterSettings | None = None,
 ) -> RenderResult:
-    """Rasterize a composition, without depth; gradients flow to it and to `means2d_offset` (pixels)."""
+    """Rasterize a composition, without depth; gradients flow to it and to `means2d_offset` (pixels).
+
+    The low-pass is always that of the composition.
+    """
     gaussians = composition.gaussians
     return rasterize(
         gaussians,
         camera,
         torch.tensor(list(background), dtype=gaussians.means.dtype),
         means2d_offset=means2d_offset,
-        settings=settings or RasterSettings(),
+        settings=replace(settings or DEFAULT_SETTINGS, blur=composition.blur),
         depth=False,
     )

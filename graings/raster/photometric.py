@@ -1,4 +1,4 @@
-"""How far an image is from its target: structural similarity and absolute difference, with their gradient.
+"""How far an image is from its target: structural similarity, absolute and squared difference, with their gradient.
 
 Fused in the compiled kernel. SSIM in the 3DGS definition: 11x11 Gaussian window of sigma 1.5, zero padding,
 C1 = 0.01^2, C2 = 0.03^2, per channel; local variances are clamped at 0 and local values to [-1, 1], with zero
@@ -22,18 +22,22 @@ def ssim(image: Tensor, target: Tensor, *, threads: int | None = None) -> Tensor
     Differentiable with respect to `image` only. Raises `ValueError` for a wrong shape, dtype or device and for a
     `target` that requires a gradient.
     """
-    return _mixture(image, target, 1.0, 0.0, threads)
+    return _mixture(image, target, 1.0, 0.0, 0.0, threads)
 
 
-def photometric(image: Tensor, target: Tensor, ssim_weight: float, *, threads: int | None = None) -> Tensor:
-    """(1 - w) |image - target|_1 + w (1 - SSIM) with w = `ssim_weight`, means over pixels and channels, Eq. 15.
+def photometric(
+    image: Tensor, target: Tensor, ssim_weight: float, squared_weight: float = 0.0, *, threads: int | None = None
+) -> Tensor:
+    """(1 - w) |image - target|_1 + w (1 - SSIM) + q (image - target)^2, means over pixels and channels.
 
-    Arguments and errors are those of `ssim`.
+    w is `ssim_weight`, q `squared_weight`; without q it is Eq. 15. Arguments and errors are those of `ssim`.
     """
-    return ssim_weight + _mixture(image, target, -ssim_weight, 1.0 - ssim_weight, threads)
+    return ssim_weight + _mixture(image, target, -ssim_weight, 1.0 - ssim_weight, squared_weight, threads)
 
 
-def _mixture(image: Tensor, target: Tensor, similarity: float, absolute: float, threads: int | None) -> Tensor:
+def _mixture(
+    image: Tensor, target: Tensor, similarity: float, absolute: float, squared: float, threads: int | None
+) -> Tensor:
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"image must have shape (H, W, 3), got {tuple(image.shape)}")
     if target.shape != image.shape:
@@ -47,23 +51,24 @@ def _mixture(image: Tensor, target: Tensor, similarity: float, absolute: float, 
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
     workers = kernel.threads() if threads is None else threads
-    value: Tensor = _Comparison.apply(image, target, similarity, absolute, workers)  # type: ignore[no-untyped-call]
+    weights = (similarity, absolute, squared)
+    value: Tensor = _Comparison.apply(image, target, weights, workers)  # type: ignore[no-untyped-call]
     return value
 
 
 class _Comparison(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, similarity: float, absolute: float, threads: int) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, weights: tuple[float, float, float], threads: int) -> Tensor:
         first, second = image.detach().contiguous(), target.detach().contiguous()
         gradient = torch.empty_like(first) if ctx.needs_input_grad[0] else None
         height, width, _ = image.shape
-        alike, apart = kernel.kernel().compare(first, second, height, width, similarity, absolute, gradient, threads)
+        means = kernel.kernel().compare(first, second, height, width, *weights, gradient, threads)
         if gradient is not None:
             ctx.save_for_backward(gradient)
-        return image.new_tensor(similarity * alike + absolute * apart)
+        return image.new_tensor(sum(weight * mean for weight, mean in zip(weights, means, strict=True)))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return gradient * upstream, None, None, None, None
+        return gradient * upstream, None, None, None

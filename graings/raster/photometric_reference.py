@@ -32,7 +32,10 @@ def ssim(image: Tensor, target: Tensor, *, threads: int | None = None) -> Tensor
     return value.clamp(-1, 1).mean().to(image.dtype)
 
 
-def photometric(image: Tensor, target: Tensor, ssim_weight: float, *, threads: int | None = None) -> Tensor:
-    """(1 - w) |image - target|_1 + w (1 - SSIM); `threads` is ignored."""
-    absolute = (image.double() - target.double()).abs().mean().to(image.dtype)
-    return (1.0 - ssim_weight) * absolute + ssim_weight * (1.0 - ssim(image, target))
+def photometric(
+    image: Tensor, target: Tensor, ssim_weight: float, squared_weight: float = 0.0, *, threads: int | None = None
+) -> Tensor:
+    """(1 - w) |image - target|_1 + w (1 - SSIM) + q (image - target)^2; `threads` is ignored."""
+    difference = image.double() - target.double()
+    absolute, squared = (mean.to(image.dtype) for mean in (difference.abs().mean(), difference.square().mean()))
+    return (1.0 - ssim_weight) * absolute + ssim_weight * (1.0 - ssim(image, target)) + squared_weight * squared

@@ -43,6 +43,7 @@ class Composition:
     deformation: Deformation | None
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
     opacities: Float[Tensor, "anchor child"]  # score of every slot, o(t) where it may be drawn at all; no gradient
+    blur: float  # low-pass that the Gaussians were trained to be seen with, px^2
 
 
 class Scene(nn.Module):
@@ -140,7 +141,9 @@ class Scene(nn.Module):
             )
             moved = None if raw is None else deformation_from(raw, extent)
             opacities = unchanged.detach().index_copy(0, awake, score.detach())
-            compositions.append(Composition(gaussians, children, drawn.centres, moved, drawn_change, opacities))
+            compositions.append(
+                Composition(gaussians, children, drawn.centres, moved, drawn_change, opacities, config.blur)
+            )
         return compositions
 
     def _lasting(self, directions: Sequence[Tensor]) -> list[Tensor]:

@@ -63,12 +63,12 @@ class Stiffness:
         )
 
 
-def step_over_size(before: Gaussians, after: Gaussians, camera: Camera) -> float | None:
+def step_over_size(before: Gaussians, after: Gaussians, camera: Camera, blur: float) -> float | None:
     """kappa_step: how far one step moved Gaussians over their own size in that direction, 99th percentile.
 
-    The size is what `camera` can see of it, with the low-pass of the footprint at its distance: a disc thinner than any
-    pixel, moved by its own thickness, moves nothing. Of those drawn both times, known by their uids; None where there
-    are none, or where one of them is lost. Both are of the same instant.
+    The size is what `camera` can see of it, with the low-pass of the footprint (`blur`, px^2) at its distance: a disc
+    thinner than any pixel, moved by its own thickness, moves nothing. Of those drawn both times, known by their uids;
+    None where there are none, or where one of them is lost. Both are of the same instant.
     """
     uids = (before.uids.numpy(), after.uids.numpy())
     _, here, there = np.intersect1d(*uids, assume_unique=True, return_indices=True)
@@ -79,7 +79,7 @@ def step_over_size(before: Gaussians, after: Gaussians, camera: Camera) -> float
     conjugates = quats * quats.new_tensor([1, -1, -1, -1])
     along = quaternion_product(quaternion_product(conjugates, moved), quats)[:, 1:]  # in each Gaussian's own axes
     pixel = (means - torch.from_numpy(camera.center)).norm(dim=1, keepdim=True) / camera.fx
-    sizes = (after.log_scales.detach()[there].double().mul(2).exp() + constants.BLUR * pixel.square()).sqrt()
+    sizes = (after.log_scales.detach()[there].double().mul(2).exp() + blur * pixel.square()).sqrt()
     lengths = (along / sizes).norm(dim=1)
     return float(np.quantile(lengths.numpy(), SHARE)) if bool(lengths.isfinite().all()) else None
 
@@ -97,17 +97,17 @@ def subpixel_share(scene: Scene, frames: Sequence[Frame], background: Sequence[f
         gaussians, radii = composition.gaussians, draw(composition, frame.camera, background).radii
         visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
         seen[composition.children[visible]] = True
-        wide[composition.children[visible & (footprints(gaussians, radii) >= SUBPIXEL)]] = True
+        wide[composition.children[visible & (footprints(gaussians, radii, composition.blur) >= SUBPIXEL)]] = True
     count = int(seen.sum())
     return int((seen & ~wide).sum()) / count if count else None
 
 
-def footprints(gaussians: Gaussians, radii: Float[Tensor, "gaussian 2"]) -> Float[Tensor, " gaussian"]:
+def footprints(gaussians: Gaussians, radii: Float[Tensor, "gaussian 2"], blur: float) -> Float[Tensor, " gaussian"]:
     """Size in px of what was drawn with `radii`: the root of the sum of both squared axes, without the low-pass.
 
     A radius is where alpha falls below the least that is drawn: sqrt(2 ln(o / alpha_min) (variance + blur)). Means
     something where a Gaussian was drawn, and more than just so.
     """
     level = 2 * (gaussians.opacities.double() / constants.ALPHA_MIN).log()
-    variances = radii.double().square() / level.unsqueeze(1) - constants.BLUR
+    variances = radii.double().square() / level.unsqueeze(1) - blur
     return variances.sum(1).clamp_min(0).sqrt()

@@ -141,8 +141,12 @@ class Trainer:
             draw(composition, frame.camera, self.background, means2d_offset=offset)
             for composition, frame, offset in zip(compositions, frames, offsets, strict=True)
         ]
+        squared = self._squared_weight()
         differences = torch.stack(
-            [photometric(r.color, target, self.config.loss.ssim) for r, target in zip(results, targets, strict=True)]
+            [
+                photometric(r.color, target, self.config.loss.ssim, squared)
+                for r, target in zip(results, targets, strict=True)
+            ]
         )
         loss = self.regularisers(compositions, [frame.time for frame in frames]) + differences.mean()
         # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.
@@ -153,7 +157,9 @@ class Trainer:
         names = ", ".join(frame.name for frame in frames)
         gradients = self.optimizer.gradients()
         gradients += [Gradient("the projected centres", SCREEN, o.grad) for o in offsets if o.grad is not None]
-        verdict = self.guard.judge(self.iteration, loss.detach(), gradients)
+        errors = [float(functional.mse_loss(r.color.detach(), t)) for r, t in zip(results, targets, strict=True)]
+        # Compared with the losses of steps before squares joined in.
+        verdict = self.guard.judge(self.iteration, loss.detach() - squared * statistics.mean(errors), gradients)
         if verdict.culprit is None:
             for group, (norm, limit) in verdict.limits.items():
                 events.append(f"clipped: gradients of {group} at {norm:.3g} limited to {limit:.3g} on {names}")
@@ -180,7 +186,6 @@ class Trainer:
         events += self._adapt()
         events += self._watch(len(children), float(differences.detach().amax()))
         self._settle()
-        errors = [float(functional.mse_loss(r.color.detach(), t)) for r, t in zip(results, targets, strict=True)]
         return StepReport(
             iteration=self.iteration,
             iterations=self.config.iterations,
@@ -194,11 +199,16 @@ class Trainer:
             events=tuple(events),
         )
 
+    def _squared_weight(self) -> float:
+        """Of the mean squared error in this step: none while anchors grow, or they would grow wherever it is large."""
+        config = self.config
+        return config.loss.squared if self.iteration > config.scaled(config.density.grow_until) else 0.0
+
     @torch.no_grad()
     def _measure(self, before: Composition, frame: Frame) -> None:
         """How far the step just taken moved what `frame` shows."""
         after = self.scene.compose(frame.camera.center, frame.time)
-        self.step_over_size = step_over_size(before.gaussians, after.gaussians, frame.camera)
+        self.step_over_size = step_over_size(before.gaussians, after.gaussians, frame.camera, before.blur)
 
     def _opening(self) -> list[str]:
         """At the first step, what was decided before it; in words."""

@@ -50,18 +50,21 @@ def test_single_precision_stays_close_to_double(size: tuple[int, int], isa: str)
     assert relative(gradient, expected_gradient) <= bound
 
 
+@pytest.mark.parametrize("squared", [0.0, 7.0])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("size", SIZES)
-def test_the_mixture_with_l1_equals_torch(size: tuple[int, int], weight: float, isa: str) -> None:
+def test_the_mixture_with_differences_equals_torch(
+    size: tuple[int, int], weight: float, squared: float, isa: str
+) -> None:
     image, target = pair(*size)
     if image.numel() > 3:
         image[0, 0] = target[0, 0]  # no difference, no direction
 
     def ours(x: Tensor, y: Tensor) -> Tensor:
-        return photometric(x, y, weight)
+        return photometric(x, y, weight, squared)
 
     def plain(x: Tensor, y: Tensor) -> Tensor:
-        return photometric_reference.photometric(x, y, weight)
+        return photometric_reference.photometric(x, y, weight, squared)
 
     value, gradient = with_gradient(ours, image, target)
     expected, expected_gradient = with_gradient(plain, image, target)
@@ -116,7 +119,7 @@ def test_what_is_equal_is_left_out_and_changes_nothing(
     image = torch.where(different, image, target)
     for ours, plain in (
         (ssim, photometric_reference.ssim),
-        (lambda x, y: photometric(x, y, 0.2), lambda x, y: photometric_reference.photometric(x, y, 0.2)),
+        (lambda x, y: photometric(x, y, 0.2, 3.0), lambda x, y: photometric_reference.photometric(x, y, 0.2, 3.0)),
     ):
         value, gradient = with_gradient(ours, image, target)
         expected, expected_gradient = with_gradient(plain, image, target)

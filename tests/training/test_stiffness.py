@@ -39,12 +39,12 @@ def test_a_step_is_measured_in_sizes_of_what_is_there_both_times() -> None:
     sharp = pinhole(focal=1e12)  # sees everything: no pixel widens a Gaussian
     before = gaussians(1_000, seed=0)
     after = _moved(before, torch.linspace(0, 1, 1_000, dtype=torch.float64))
-    assert step_over_size(before, after, sharp) == pytest.approx(0.99, abs=1e-6)
+    assert step_over_size(before, after, sharp, BLUR) == pytest.approx(0.99, abs=1e-6)
     # Others come and go, and rows change places: each is still compared with itself.
     order = torch.randperm(900, generator=torch.Generator().manual_seed(1)) + 100
-    common = step_over_size(rows(before, torch.arange(950)), rows(after, order), sharp)
+    common = step_over_size(rows(before, torch.arange(950)), rows(after, order), sharp, BLUR)
     assert common == pytest.approx((100 + 0.99 * 849) / 999, abs=1e-6)
-    assert step_over_size(rows(before, torch.arange(10)), rows(after, torch.arange(10, 20)), sharp) is None
+    assert step_over_size(rows(before, torch.arange(10)), rows(after, torch.arange(10, 20)), sharp, BLUR) is None
 
 
 def test_what_is_lost_has_no_length() -> None:
@@ -52,7 +52,7 @@ def test_what_is_lost_has_no_length() -> None:
     for lost in (math.nan, math.inf):
         means = before.means.clone()
         means[3, 1] = lost
-        assert step_over_size(before, replace(before, means=means), pinhole()) is None
+        assert step_over_size(before, replace(before, means=means), pinhole(), BLUR) is None
 
 
 def test_a_step_that_was_undone_is_not_told_of(micro: Path) -> None:
@@ -87,7 +87,7 @@ def test_what_is_thinner_than_a_pixel_is_as_wide_as_the_low_pass() -> None:
         log_scales=torch.tensor([[-25.0, -25.0, -25.0]], dtype=torch.float64),
     )
     pixel = torch.tensor([[2.0 / 40.0, 0.0, 0.0]], dtype=torch.float64)
-    assert step_over_size(disc, replace(disc, means=disc.means + pixel), camera) == pytest.approx(
+    assert step_over_size(disc, replace(disc, means=disc.means + pixel), camera, BLUR) == pytest.approx(
         1 / math.sqrt(BLUR), rel=1e-3
     )
 
@@ -106,13 +106,13 @@ def test_a_footprint_is_the_projected_size_without_its_low_pass() -> None:
     camera = pinhole(focal=40.0)
     ground = torch.ones(3, dtype=torch.float64)
     expected = 40.0 * sizes / 2.0
-    size = footprints(balls, rasterize(balls, camera, ground).radii)
+    size = footprints(balls, rasterize(balls, camera, ground).radii, BLUR)
     torch.testing.assert_close(size, math.sqrt(2) * expected, rtol=1e-3, atol=0)
     scales = balls.log_scales.clone()
     scales[:, 1:] = -20
     needles = replace(balls, log_scales=scales)
     torch.testing.assert_close(
-        footprints(needles, rasterize(needles, camera, ground).radii), expected, rtol=1e-3, atol=0
+        footprints(needles, rasterize(needles, camera, ground).radii, BLUR), expected, rtol=1e-3, atol=0
     )
 
 

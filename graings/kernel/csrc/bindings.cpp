@@ -2,7 +2,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
-#include <nanobind/stl/pair.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -207,13 +207,13 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         nb::gil_scoped_release release;
         graings::differentiate<R>(layers, rows, input.data(), kept, upstream, v_in, w, b, v_common, threads);
     });
-    m.def("compare", [](In<R> image, In<R> target, int64_t height, int64_t width, double similarity, double absolute, std::optional<Out<R>> gradient, int threads) {
+    m.def("compare", [](In<R> image, In<R> target, int64_t height, int64_t width, double similarity, double absolute, double squared, std::optional<Out<R>> gradient, int threads) {
         const size_t size = size_t(3 * height * width);
         const R *first = checked(image, size, "image"), *second = checked(target, size, "target");
         R* out = checked(gradient, size, "gradient");
         nb::gil_scoped_release release;
-        const auto mean = graings::compare<R>(height, width, first, second, {similarity, absolute}, out, threads);
-        return std::pair(mean.similarity, mean.absolute);
+        const auto mean = graings::compare<R>(height, width, first, second, {similarity, absolute, squared}, out, threads);
+        return std::tuple(mean.similarity, mean.absolute, mean.squared);
     });
 }
 

@@ -43,17 +43,20 @@ Likeness compare(int64_t height, int64_t width, const R* image, const R* target,
     const int64_t rows = part.bottom - part.top, columns = part.right - part.left, first = 3 * (part.top * width + part.left);
     const int64_t bands = (rows + kBand - 1) / kBand, row = 3 * columns + 2 * 15 + 2 * kLanes;
     const double scale = 1.0 / (3.0 * double(height) * double(width));
-    Buffer<double> sums{size_t(2 * bands)};
+    Buffer<double> sums{size_t(3 * bands)};
     Buffer<R> maps(gradient ? size_t(9 * rows * columns) : 1), scratch(size_t(threads) * size_t(5 * row));
     const SsimArgs<R> args{rows, columns, 3 * width, image + first, target + first, gradient ? gradient + first : nullptr, gradient ? maps.get() : nullptr, sums.get(),
-                           R(weights.similarity * scale), R(weights.absolute * scale)};
+                           R(weights.similarity * scale), R(weights.absolute * scale), R(weights.squared * scale)};
     if (gradient && rows * columns < height * width) std::fill_n(gradient, 3 * height * width, R(0));
     const auto end = [&](int64_t band) { return std::min(rows, (band + 1) * kBand); };
     parallel_for(threads, bands, [&](int worker, int64_t band) { run.ssim_values(args, band, band * kBand, end(band), scratch.get() + worker * 5 * row); });
     if (gradient)
         parallel_for(threads, bands, [&](int worker, int64_t band) { run.ssim_gradient(args, band * kBand, end(band), scratch.get() + worker * 5 * row); });
-    Likeness mean{1.0 - double(rows * columns) / (double(height) * double(width)), 0.0};
-    for (int64_t band = 0; band < bands; band++) mean.similarity += sums[size_t(2 * band)] * scale, mean.absolute += sums[size_t(2 * band + 1)] * scale;
+    Likeness mean{1.0 - double(rows * columns) / (double(height) * double(width)), 0.0, 0.0};
+    for (int64_t band = 0; band < bands; band++) {
+        const double* of_band = sums.get() + 3 * band;
+        mean.similarity += of_band[0] * scale, mean.absolute += of_band[1] * scale, mean.squared += of_band[2] * scale;
+    }
     return mean;
 }
 

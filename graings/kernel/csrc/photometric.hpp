@@ -1,15 +1,15 @@
-// How alike two images are, and the gradient of a mixture of two measures of it.
+// How alike two images are, and the gradient of a mixture of three measures of it.
 #pragma once
 #include <cstdint>
 
 namespace graings {
 
 struct Likeness {
-    double similarity, absolute;  // means over pixels and channels
+    double similarity, absolute, squared;  // means over pixels and channels
 };
 
-// Mean structural similarity and mean absolute difference of two [height, width, 3] images. `gradient`, which may
-// be null, is that of weights.similarity * similarity + weights.absolute * absolute.
+// Mean structural similarity, mean absolute and mean squared difference of two [height, width, 3] images. `gradient`,
+// which may be null, is that of their sum weighed by `weights`.
 template <class R>
 Likeness compare(int64_t height, int64_t width, const R* image, const R* target, Likeness weights, R* gradient, int threads);
 

@@ -1,5 +1,6 @@
 // Structural similarity in the 3DGS definition (11x11 Gaussian window, sigma 1.5, zero padding, per channel), the
-// absolute difference, and the gradient of a mixture of both with respect to the first image. Rows are independent: any split over threads gives the same bits.
+// absolute and the squared difference, and the gradient of a mixture of the three with respect to the first image. Rows
+// are independent: any split over threads gives the same bits.
 #pragma once
 #include "tiles.hpp"
 #include "types.hpp"
@@ -37,13 +38,13 @@ GRAINGS_INLINE P<R> across(const R* row) {
     return sum;
 }
 
-// Values of rows [begin, end): their sums go to sums[2 * band]; with a gradient wanted, its three maps are kept.
+// Values of rows [begin, end): their sums go to sums[3 * band]; with a gradient wanted, its three maps are kept.
 template <class R>
 static void ssim_values(const SsimArgs<R>& args, int64_t band, int64_t begin, int64_t end, R* scratch) {
     const int64_t length = 3 * args.width, stride = padded(args.width), plane = args.height * length;
     const R c1 = R(0.01 * 0.01), c2 = R(0.03 * 0.03);
     std::memset(scratch, 0, sizeof(R) * size_t(5 * stride));
-    double total = 0, apart = 0;
+    double total = 0, apart = 0, squared = 0;
     for (int64_t y = begin; y < end; y++) {
         const int64_t top = y < kRadius ? -y : -kRadius, bottom = args.height - 1 - y < kRadius ? args.height - 1 - y : kRadius;
         for (int64_t x = 0; x < length; x += kLanes) {
@@ -72,7 +73,10 @@ static void ssim_values(const SsimArgs<R>& args, int64_t band, int64_t begin, in
             const P<R> difference = load_some(args.image + y * args.row + x, length - x) - load_some(args.target + y * args.row + x, length - x);
             store(lanes, clamp(raw, zero - one, one)), store(differences, max(difference, zero - difference));
             const int64_t n = length - x < kLanes ? length - x : kLanes;
-            for (int64_t i = 0; i < n; i++) total += double(lanes[i]), apart += double(differences[i]);
+            for (int64_t i = 0; i < n; i++) {
+                const double d = double(differences[i]);
+                total += double(lanes[i]), apart += d, squared += d * d;
+            }
             if (!args.maps) continue;
             const auto inside = [&](P<R> value) { return select(raw <= one, select(zero - one <= raw, value, zero), zero); };
             const P<R> g_vxy = two * a1 * inverse;
@@ -83,7 +87,7 @@ static void ssim_values(const SsimArgs<R>& args, int64_t band, int64_t begin, in
             store_some(map + 2 * plane, length - x, inside(g_vxy));
         }
     }
-    args.sums[2 * band] = total, args.sums[2 * band + 1] = apart;
+    args.sums[3 * band] = total, args.sums[3 * band + 1] = apart, args.sums[3 * band + 2] = squared;
 }
 
 // Filters the maps back: the window is symmetric, so the adjoint of the filter is the filter.
@@ -91,7 +95,7 @@ template <class R>
 static void ssim_gradient(const SsimArgs<R>& args, int64_t begin, int64_t end, R* scratch) {
     const int64_t length = 3 * args.width, stride = padded(args.width), plane = args.height * length;
     std::memset(scratch, 0, sizeof(R) * size_t(3 * stride));
-    const P<R> zero = p16(R(0)), similarity = p16(args.similarity), absolute = p16(args.absolute);
+    const P<R> zero = p16(R(0)), similarity = p16(args.similarity), absolute = p16(args.absolute), squared = p16(R(2) * args.squared);
     for (int64_t y = begin; y < end; y++) {
         const int64_t top = y < kRadius ? -y : -kRadius, bottom = args.height - 1 - y < kRadius ? args.height - 1 - y : kRadius;
         for (int64_t x = 0; x < length; x += kLanes) {
@@ -108,7 +112,7 @@ static void ssim_gradient(const SsimArgs<R>& args, int64_t begin, int64_t end, R
             const P<R> image = load_some(args.image + at, n), target = load_some(args.target + at, n);
             const P<R> g = fma(p16(R(2)) * image, across(in + stride), fma(target, across(in + 2 * stride), across(in)));
             const P<R> sign = select(target < image, absolute, select(image < target, zero - absolute, zero));
-            store_some(args.gradient + at, n, fma(similarity, g, sign));
+            store_some(args.gradient + at, n, fma(similarity, g, fma(squared, image - target, sign)));
         }
     }
 }

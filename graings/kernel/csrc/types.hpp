@@ -138,8 +138,8 @@ struct SsimArgs {
     const R *image, *target;
     R* gradient;    // [height, width, 3] or null
     R* maps;        // three planes [height, width, 3]: what the gradient filters back
-    double* sums;   // per band: of the similarity and of |image - target|
-    R similarity, absolute;  // what each number counts in the gradient
+    double* sums;   // per band: of the similarity, of |image - target| and of its square
+    R similarity, absolute, squared;  // what each number counts in the gradient
 };
 
 constexpr int kMaxLayers = 16;
