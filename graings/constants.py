@@ -16,7 +16,8 @@ TRANSMITTANCE_MIN: Final = 1e-4
 # Upper bound of one Gaussian's alpha (below Eq. c_final of the paper).
 ALPHA_MAX: Final = 0.99
 
-# Variance in px^2 added to both image axes: the low-pass that keeps edge-on discs drawable (3DGS).
+# Variance in px^2 added to both image axes: the low-pass that keeps edge-on discs drawable (3DGS). A trained scene
+# brings its own, `scene.blur`.
 BLUR: Final = 0.3
 
 # Near plane in normalised units (the scene is about 1 across), never an absolute length.

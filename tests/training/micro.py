@@ -117,8 +117,8 @@ def spoil_loss(
     """Multiply the photometric loss by `factor` in the steps that `when` chooses."""
     true = trainer_module.photometric
 
-    def spoiled(image: Tensor, target: Tensor, weight: float) -> Tensor:
-        value = true(image, target, weight)
+    def spoiled(image: Tensor, target: Tensor, *weights: float) -> Tensor:
+        value = true(image, target, *weights)
         return value * factor if when(trainer.iteration) else value
 
     monkeypatch.setattr(trainer_module, "photometric", spoiled)

@@ -72,7 +72,8 @@ def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.Monkey
     losses: list[Tensor] = []
     for frame in chosen:
         drawn = draw(before.compose(frame.camera.center, frame.time), frame.camera, trainer.background)
-        losses.append(photometric(drawn.color, torch.from_numpy(trainer.images.rgb(frame)), 0.2))
+        target, weights = torch.from_numpy(trainer.images.rgb(frame)), trainer.config.loss
+        losses.append(photometric(drawn.color, target, weights.ssim, weights.squared))
     assert len(losses) > 1
     mean = torch.stack(losses).mean()
     mean.backward()

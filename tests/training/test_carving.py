@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from statistics import mean
 
 import numpy as np
 import pytest
@@ -59,15 +60,19 @@ def test_a_clip_in_which_things_stay_in_place_begins_as_a_whole(tmp_path: Path) 
 
 
 def test_what_flies_is_not_lost(flight: Path) -> None:
-    found = []
-    for options in ({}, {"time_window": 1.0}):
-        trainer = micro_trainer(flight, iterations=400, **{"init.points": 20_000}, **GROWING, **options)
-        reports = steps(trainer, 400)
-        assert len(said(reports[:1], "time_window: begins with the middle")) == (0 if options else 1)
-        assert said(reports[1:], "time_window") == []
-        found.append(quality(trainer))
-    print(f"by itself {found[0]:.2f} dB, the whole clip from the start {found[1]:.2f} dB")
-    assert found[0] > found[1] + 2
+    gains = []
+    for seed in range(3):  # they lie a decibel apart
+        found = []
+        for options in ({}, {"time_window": 1.0}):
+            few = {"iterations": 400, "seed": seed, "init.points": 20_000}
+            trainer = micro_trainer(flight, **few, **GROWING, **options)
+            reports = steps(trainer, 400)
+            assert len(said(reports[:1], "time_window: begins with the middle")) == (0 if options else 1)
+            assert said(reports[1:], "time_window") == []
+            found.append(quality(trainer))
+        print(f"seed {seed}: by itself {found[0]:.2f} dB, the whole clip from the start {found[1]:.2f} dB")
+        gains.append(found[0] - found[1])
+    assert mean(gains) > 2
 
 
 def test_too_few_views_do_not_speak_for_a_part_of_the_clip(flight: Path) -> None:
