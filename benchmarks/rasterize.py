@@ -14,8 +14,9 @@ yardstick runs in a process of its own, because both would otherwise share the t
 keep a core busy long after a call.
 
 Prints median (minimum) in ms, the ratio of the medians, and the memory that one forward + backward takes at its peak
-beyond its inputs: images, upstream and gradients count, and nothing freed before is at hand.
-`backward_given` is forward + backward for an upstream made beforehand: what threads can share.
+beyond its inputs: images and gradients count, and nothing freed before is at hand.
+`backward_given` is forward + backward for an upstream made beforehand: what threads can share, and what memory is
+measured with.
 `--oracle` adds the plain torch oracle (slow).
 """
 
@@ -168,13 +169,13 @@ def measure_memory(folder: Path, name: str) -> float:
     """What `peak_mb` asks of its process."""
     scene = scenes.named(name, folder)
     ours = Ours(scene)
-    del ours.image, ours.given
+    del ours.image
     Ours(scenes.named("100/16", folder)).forward_backward()  # libraries come in
     if hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
         libc.malloc_trim(0)  # what was freed would hide what is asked for
     before = _status_kb("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
-    ours.forward_backward()
+    ours.backward_given()
     return (_status_kb("VmHWM") - before) / 1000
 
 
