@@ -7,6 +7,8 @@ All lengths are in normalised units (`graings.units`). Knows nothing of images, 
 from __future__ import annotations
 
 import math
+import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -135,3 +137,8 @@ class View:
     name: str
     camera: Camera
     time: float
+
+
+def sampling(cameras: Sequence[Camera]) -> float:
+    """How finely `cameras` look, in the median: fx fy, the px^2 that a unit square at unit distance covers."""
+    return statistics.median(camera.fx * camera.fy for camera in cameras)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from graings.camera import Camera, View
+from graings.camera import Camera, View, sampling
 from graings.config import TrainConfig, restored_shape, restored_training
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
@@ -71,7 +71,14 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
     config = restored_training(facts["config"], path)
     shape = restored_shape(facts["scene_config"], path)
     rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
-    scene = Scene(shape, Scaffold(**rows), extent=float(tensors["extent"]), initial_opacity=0.1)
+    views = {split: tuple(map(_view_from_json, members)) for split, members in facts["views"].items()}
+    scene = Scene(
+        shape,
+        Scaffold(**rows),
+        extent=float(tensors["extent"]),
+        sampling=sampling([view.camera for view in views["train"]]),
+        initial_opacity=0.1,
+    )
     scene.load_state_dict(tensors)
     scene.temporal = facts["temporal"]
     units = facts["units"]
@@ -81,7 +88,7 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
             tuple(units["center"]), units["scale"], units["time_start"], units["time_span"], tuple(units["up"])
         ),
         background=tuple(facts["background"]),
-        views={split: tuple(map(_view_from_json, views)) for split, views in facts["views"].items()},
+        views=views,
         config=config,
         iteration=facts["iteration"],
         finished=facts["finished"],

@@ -11,6 +11,9 @@ from graings.scene.scene import Scene
 EYE = (0.0, -2.0, 0.5)
 
 
+SAMPLING = 30.0**2  # fx fy of small test cameras, about
+
+
 def tiny_scene(
     *, anchors: int = 20, seed: int = 0, temporal: bool = True, awake: bool = True, **config: object
 ) -> Scene:
@@ -26,7 +29,7 @@ def tiny_scene(
         features=torch.randn(anchors, settings.feature_dim),
         offsets=torch.randn(anchors, settings.children, 3) * 0.3,
     )
-    scene = Scene(settings, scaffold, extent=1.0, initial_opacity=0.3)
+    scene = Scene(settings, scaffold, extent=1.0, sampling=SAMPLING, initial_opacity=0.3)
     if awake:
         with torch.no_grad():
             for module in (scene.deformation, scene.residual):

@@ -43,25 +43,35 @@ class Composition:
     deformation: Deformation | None
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
     opacities: Float[Tensor, "anchor child"]  # score of every slot, o(t) where it may be drawn at all; no gradient
-    blur: float  # low-pass that the Gaussians were trained to be seen with, px^2
+    blur: float  # low-pass that the Gaussians were trained to be seen with, px^2 of views with this `sampling`
+    sampling: float  # fx fy of those views, px^2
 
 
 class Scene(nn.Module):
     """The model. `temporal` off (static warm-up, or a single instant) leaves the time modules unevaluated.
 
-    `extent` is the half-size of the content in normalised units; positions enter the networks divided by it. `seed` is
-    that of the networks' first weights.
+    `extent` is the half-size of the content in normalised units; positions enter the networks divided by it. `sampling`
+    is fx fy of the views it is trained on, px^2: the low-pass is a part of what was learned, as large on the scene for
+    any other picture. `seed` is that of the networks' first weights.
     """
 
     extent: Tensor
 
     def __init__(
-        self, config: SceneConfig, scaffold: Scaffold, *, extent: float, initial_opacity: float, seed: int = 0
+        self,
+        config: SceneConfig,
+        scaffold: Scaffold,
+        *,
+        extent: float,
+        sampling: float,
+        initial_opacity: float,
+        seed: int = 0,
     ) -> None:
         super().__init__()
         self.config = config
         self.scaffold = scaffold
         self.register_buffer("extent", torch.tensor(float(extent), dtype=scaffold.features.dtype))
+        self.sampling = sampling
         self.temporal = False
         self.residual: ResidualField | None = None
         self.single: SingleMLP | None = None
@@ -142,7 +152,9 @@ class Scene(nn.Module):
             moved = None if raw is None else deformation_from(raw, extent)
             opacities = unchanged.detach().index_copy(0, awake, score.detach())
             compositions.append(
-                Composition(gaussians, children, drawn.centres, moved, drawn_change, opacities, config.blur)
+                Composition(
+                    gaussians, children, drawn.centres, moved, drawn_change, opacities, config.blur, self.sampling
+                )
             )
         return compositions
 

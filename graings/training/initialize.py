@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from graings.camera import sampling
 from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
@@ -69,7 +70,14 @@ def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, stream
         features=torch.randn(count, scene.feature_dim, generator=generator) * FEATURE_STD,
         offsets=torch.randn(count, scene.children, 3, generator=generator) * config.init.offset_std,
     )
-    made = Scene(scene, scaffold, extent=extent, initial_opacity=config.init.opacity, seed=config.seed)
+    made = Scene(
+        scene,
+        scaffold,
+        extent=extent,
+        sampling=sampling([frame.camera for frame in capture.train]),
+        initial_opacity=config.init.opacity,
+        seed=config.seed,
+    )
     return Start(made, voxel, window)
 
 

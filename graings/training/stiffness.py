@@ -20,7 +20,7 @@ from graings import constants
 from graings.camera import Camera
 from graings.capture.capture import Frame
 from graings.gaussians import Gaussians
-from graings.render import draw
+from graings.render import draw, low_pass
 from graings.scene.children import quaternion_product
 from graings.scene.scene import Scene
 
@@ -97,7 +97,11 @@ def subpixel_share(scene: Scene, frames: Sequence[Frame], background: Sequence[f
         gaussians, radii = composition.gaussians, draw(composition, frame.camera, background).radii
         visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
         seen[composition.children[visible]] = True
-        wide[composition.children[visible & (footprints(gaussians, radii, composition.blur) >= SUBPIXEL)]] = True
+        wide[
+            composition.children[
+                visible & (footprints(gaussians, radii, low_pass(composition, frame.camera)) >= SUBPIXEL)
+            ]
+        ] = True
     count = int(seen.sum())
     return int((seen & ~wide).sum()) / count if count else None
 

@@ -22,7 +22,7 @@ from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.errors import DivergedError
 from graings.raster.photometric import photometric
-from graings.render import draw
+from graings.render import draw, low_pass
 from graings.scene.scene import Composition, Scene
 from graings.training.average import Average
 from graings.training.collapse import SCORE, Collapse, mend
@@ -208,7 +208,9 @@ class Trainer:
     def _measure(self, before: Composition, frame: Frame) -> None:
         """How far the step just taken moved what `frame` shows."""
         after = self.scene.compose(frame.camera.center, frame.time)
-        self.step_over_size = step_over_size(before.gaussians, after.gaussians, frame.camera, before.blur)
+        self.step_over_size = step_over_size(
+            before.gaussians, after.gaussians, frame.camera, low_pass(before, frame.camera)
+        )
 
     def _opening(self) -> list[str]:
         """At the first step, what was decided before it; in words."""
