@@ -362,6 +362,13 @@ MUTANTS = (
         SCENE,
     ),
     Mutant("rim", "differing part one pixel too narrow", f"{SOURCE}/photometric.cpp", "kRim = 10;", "kRim = 9;"),
+    Mutant(
+        "square",
+        "squares without the two of their gradient",
+        f"{SOURCE}/ssim.hpp",
+        "R(2) * args.squared",
+        "args.squared",
+    ),
 )
 
 
