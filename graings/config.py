@@ -134,7 +134,7 @@ class LossConfig(Part):
         10.0,
         ge=0,
         description="Weight of the mean squared error, which joins the photometric loss after the last growth. Not in "
-        "the paper: what few views show, as a highlight, absolute differences outvote.",
+        "the paper: absolute differences let a few large errors stand.",
     )
     temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
     deformation: float = Field(0.001, ge=0, description="lambda_2, magnitude of the deformation.")

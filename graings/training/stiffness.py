@@ -97,17 +97,14 @@ def subpixel_share(scene: Scene, frames: Sequence[Frame], background: Sequence[f
         gaussians, radii = composition.gaussians, draw(composition, frame.camera, background).radii
         visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
         seen[composition.children[visible]] = True
-        wide[
-            composition.children[
-                visible & (footprints(gaussians, radii, low_pass(composition, frame.camera)) >= SUBPIXEL)
-            ]
-        ] = True
+        sizes = footprints(gaussians, radii, low_pass(composition, frame.camera))
+        wide[composition.children[visible & (sizes >= SUBPIXEL)]] = True
     count = int(seen.sum())
     return int((seen & ~wide).sum()) / count if count else None
 
 
 def footprints(gaussians: Gaussians, radii: Float[Tensor, "gaussian 2"], blur: float) -> Float[Tensor, " gaussian"]:
-    """Size in px of what was drawn with `radii`: the root of the sum of both squared axes, without the low-pass.
+    """Size in px of what was drawn with `radii`: the root of the sum of both squared axes, without the low-pass `blur`.
 
     A radius is where alpha falls below the least that is drawn: sqrt(2 ln(o / alpha_min) (variance + blur)). Means
     something where a Gaussian was drawn, and more than just so.

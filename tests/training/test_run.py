@@ -13,11 +13,13 @@ import torch
 
 from graings.capture.synthetic import write_synthetic
 from graings.checkpoint import load_model, newest_checkpoint
+from graings.compact import open_model
 from graings.config import SHAPE_BEFORE, TrainConfig, make_config
 from graings.errors import CheckpointError
 from graings.evaluation import evaluate, evaluate_run
 from graings.metrics import SplitMetrics
 from graings.raster.photometric import photometric
+from graings.render import low_pass
 from graings.training.run import TrainingRun
 
 ITERATIONS = 60
@@ -398,6 +400,17 @@ def test_options_of_another_version_are_named_and_not_taken_for_damage(capture: 
     for read in (TrainingRun.resume, load_model):
         with pytest.raises(CheckpointError, match=r"scene\.gone_since.*Use the version that wrote it"):
             read(tmp_path / "run")
+
+
+def test_a_model_remembers_whose_pixels_its_low_pass_counts(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", _config(iterations=12))
+    list(run)
+    cameras = [frame.camera for frame in run.capture.train]
+    for path in (tmp_path / "run", tmp_path / "run" / "model.graings"):
+        scene = open_model(path).scene
+        assert scene.sampling == run._trainer.scene.sampling
+        for camera in cameras:
+            assert low_pass(scene.compose(camera.center, 0.5), camera) == scene.config.blur
 
 
 @pytest.mark.parametrize(("name", "before"), SHAPE_BEFORE.items())
