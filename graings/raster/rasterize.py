@@ -38,6 +38,8 @@ def rasterize(
     result has the same bits for any number. Pixels are computed in the dtype of the Gaussians, geometry always
     in float64.
 
+    What the gradient needs is given back once it has been computed: a second one, of a retained graph, draws again.
+
     Raises `ValueError` for a wrong shape, dtype or device, `KernelError` when the kernel is not built.
     """
     check_arguments(gaussians, background, means2d_offset, threads)
@@ -134,8 +136,8 @@ class _Rasterize(torch.autograd.Function):
         frame, images = _draw(inputs, camera, settings, depth, threads, gradient=True)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*images[3:])
-        ctx.save_for_backward(*inputs[:7])
-        ctx.frame, ctx.threads, ctx.size = frame, threads, (camera.height, camera.width)
+        ctx.save_for_backward(*inputs)
+        ctx.frame, ctx.view, ctx.threads = frame, (camera, settings), threads
         return (*images, frame.culled)
 
     @staticmethod
@@ -146,16 +148,17 @@ class _Rasterize(torch.autograd.Function):
         nothing: tuple[None, ...] = (None,) * 12
         if v_color is None and v_alpha is None and v_depth is None:
             return nothing
-        means, quats, log_scales, opacities, colors, ground, shift = ctx.saved_tensors
-        upstream = means.new_zeros(*ctx.size, 3) if v_color is None else v_color
+        means, quats, log_scales, opacities, colors, ground, shift, _ = ctx.saved_tensors
         inputs = (means, quats, log_scales, opacities, colors)
-        gradients: list[Tensor | None] = [torch.empty_like(t) for t in inputs]
-        gradients.append(torch.empty_like(ground) if ctx.needs_input_grad[len(inputs)] else None)
-        v_shift = None if shift is None else torch.empty_like(shift)
+        camera, settings = ctx.view
+        if not ctx.frame.has_gradient:  # of a graph that was retained: the frame gave its memory back the first time
+            ctx.frame, _ = _draw(ctx.saved_tensors, camera, settings, False, ctx.threads, gradient=True)
+        upstream = means.new_zeros(camera.height, camera.width, 3) if v_color is None else v_color
         upstreams = [_prepared(v) for v in (upstream, v_alpha, v_depth)]
-        ctx.frame.gradient(
-            len(means),
-            *_addresses(*inputs, ground, shift, *upstreams, *gradients, v_shift),
-            ctx.threads,
-        )
-        return (*gradients, v_shift, None, None, None, None, None)
+        v_ground = torch.empty_like(ground) if ctx.needs_input_grad[len(inputs)] else None
+        ctx.frame.pixels_gradient(*_addresses(ground, *upstreams, v_ground), ctx.threads)
+        # only now: they find room where the frame kept what it has given back
+        gradients = [torch.empty_like(tensor) for tensor in inputs]
+        v_shift = None if shift is None else torch.empty_like(shift)
+        ctx.frame.gaussians_gradient(len(means), *_addresses(*inputs, ground, shift, *gradients, v_shift), ctx.threads)
+        return (*gradients, v_ground, v_shift, None, None, None, None, None)

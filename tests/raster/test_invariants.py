@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -206,6 +207,32 @@ def test_what_torch_has_yet_to_negate_or_to_write_counts_as_what_it_says() -> No
     assert expected.abs().amax() > 0
     (silent,) = torch.autograd.grad(color, means, torch._efficientzerotensor(color.shape, dtype=color.dtype))
     assert (silent == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_retained_graph_gives_every_gradient_as_if_it_were_the_first(dtype: torch.dtype) -> None:
+    """What the kernel keeps for a gradient goes when it has been asked for; for a second one it draws again."""
+    batch, camera = cast(gaussians(50, 31), dtype), pinhole()
+    leaves = {name: getattr(batch, name).clone().requires_grad_() for name in FLOATS}
+    background = torch.tensor(BACKGROUND, dtype=dtype).requires_grad_()
+    ends = [*leaves.values(), background]
+
+    def gradients(images: Sequence[Tensor], seed: int) -> tuple[Tensor, ...]:
+        cotangent = upstream(camera, seed).to(dtype)
+        return torch.autograd.grad(
+            images, ends, [cotangent[..., :3], *cotangent[..., 3:].unbind(-1)], retain_graph=True
+        )
+
+    def images() -> tuple[Tensor, Tensor, Tensor]:
+        result = rasterize(replace(batch, **leaves), camera, background)
+        assert result.depth is not None
+        return result.color, result.alpha, result.depth
+
+    kept = images()
+    for seed in (0, 1, 0):
+        for again, first in zip(gradients(kept, seed), gradients(images(), seed), strict=True):
+            assert torch.equal(again, first)
+            assert first.abs().sum() > 0
 
 
 def test_drawing_works_in_inference_mode() -> None:

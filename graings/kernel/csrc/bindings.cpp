@@ -149,14 +149,20 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         }, "of each stage")
         .def_prop_ro("pairs", &Frame<R>::pairs, "(tile, Gaussian) pairs")
         .def_prop_ro("evaluated", &Frame<R>::evaluated, "(pixel, Gaussian) pairs that were looked at")
-        .def("gradient",
-             [](const Frame<R>& frame, int64_t count, Address means, Address quats, Address log_scales, Address opacities, Address colors, Address background,
-                Address offset, Address v_color, Address v_alpha, Address v_depth, Address g_means, Address g_quats, Address g_log_scales, Address g_opacities,
-                Address g_colors, Address g_background, Address g_offset, int threads) {
-                 const auto in = inputs<R>(count, means, quats, log_scales, opacities, colors, background, offset);
-                 const graings::Gradients<R> out{at<R>(g_means), at<R>(g_quats), at<R>(g_log_scales), at<R>(g_opacities), at<R>(g_colors), at<R>(g_background), at<R>(g_offset)};
+        .def_prop_ro("has_gradient", &Frame<R>::has_gradient, "whether there is one, and nobody has asked for it yet")
+        .def("pixels_gradient",
+             [](Frame<R>& frame, Address background, Address v_color, Address v_alpha, Address v_depth, Address g_background, int threads) {
+                 const R *ground = needed<R>(background, 1, "background"), *color = needed<R>(v_color, 1, "v_color");
                  nb::gil_scoped_release release;
-                 frame.gradient(in, needed<R>(v_color, 1, "v_color"), at<R>(v_alpha), at<R>(v_depth), out, threads);
+                 frame.pixels_gradient(ground, color, at<R>(v_alpha), at<R>(v_depth), at<R>(g_background), threads);
+             })
+        .def("gaussians_gradient",
+             [](Frame<R>& frame, int64_t count, Address means, Address quats, Address log_scales, Address opacities, Address colors, Address background,
+                Address offset, Address g_means, Address g_quats, Address g_log_scales, Address g_opacities, Address g_colors, Address g_offset, int threads) {
+                 const auto in = inputs<R>(count, means, quats, log_scales, opacities, colors, background, offset);
+                 const graings::Gradients<R> out{at<R>(g_means), at<R>(g_quats), at<R>(g_log_scales), at<R>(g_opacities), at<R>(g_colors), at<R>(g_offset)};
+                 nb::gil_scoped_release release;
+                 frame.gaussians_gradient(in, out, threads);
              });
     m.def(draw_name,
           [](int64_t count, Address means, Address quats, Address log_scales, Address opacities, Address colors, Address background, Address offset, Address uids,

@@ -48,8 +48,8 @@ constexpr uint32_t kRowsFrom[] = {0xFFFF, 0xFFF0, 0xFF00, 0xF000}, kRowsTo[] = {
 }  // namespace
 
 template <class R>
-Binning<R>::Binning(const Camera& camera, bool compat, const Record<R>* records, Span* spans, const double* depths, const int64_t* uids, int threads)
-    : begin(size_t(pieces_of(camera.width, kTile) * pieces_of(camera.height, kTile)) + 1), across_(pieces_of(camera.width, kTile)),
+Binning<R>::Binning(const Camera& camera, bool compat, int64_t gaussians, const Record<R>* records, Span* spans, const double* depths, const int64_t* uids, int threads)
+    : begin(size_t(pieces_of(camera.width, kTile) * pieces_of(camera.height, kTile)) + 1), places(size_t(gaussians) + 1), across_(pieces_of(camera.width, kTile)),
       tiles_(across_ * pieces_of(camera.height, kTile)), width_(camera.width), compat_(compat), records_(records), spans_(spans),
       depths_(depths), uids_(uids), threads_(threads), counts_(size_t(threads)) {}
 
@@ -60,7 +60,7 @@ void Binning<R>::count(Piece& piece) {
     uint32_t* tile = counts.data();
     for (int64_t i = piece.begin; i < piece.end; i++) {
         Span& span = spans_[i];
-        span.begin = uint32_t(piece.pairs);
+        places[size_t(i)] = uint32_t(piece.pairs);  // of this piece
         if (span.count == 0) continue;
         const uint32_t columns = span.last_column() - span.first_column(), rows = span.last_row() - span.first_row();
         uint32_t* first = tile + span.first_row() * across_ + span.first_column();
@@ -108,6 +108,7 @@ void Binning<R>::enter(const std::vector<Piece>& pieces) {
         if (total - begin[size_t(tile)] > kMostEntries) throw std::length_error("more than 2^24 Gaussians on one tile");
     }
     begin[size_t(tiles_)] = total;
+    places[pieces.empty() ? 0 : size_t(pieces.back().end)] = uint32_t(total);
     pairs = Buffer<Pair>(size_t(count_));
     parallel_for(threads_, int64_t(counts_.size()), [&](int, int64_t worker) {
         for (size_t k = 0; k < pieces.size(); k++)
@@ -119,10 +120,10 @@ template <class R>
 void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next) {
     Pair nowhere, *out = pairs.get();
     for (int64_t i = piece.begin; i < piece.end; i++) {
-        Span& span = spans_[i];
-        span.begin += first_place;
+        const Span& span = spans_[i];
+        const uint32_t begin = places[size_t(i)] += first_place;
         if (span.count == 0) continue;
-        const uint32_t id = uint32_t(i), depth = key(i), begin = span.begin, columns = span.last_column() - span.first_column(), rows = span.last_row() - span.first_row();
+        const uint32_t id = uint32_t(i), depth = key(i), columns = span.last_column() - span.first_column(), rows = span.last_row() - span.first_row();
         const uint32_t left = kColumnsFrom[span.left % Span::kPerTile], right = kColumnsTo[span.right % Span::kPerTile];
         const uint32_t top = kRowsFrom[span.top % Span::kPerTile], bottom = kRowsTo[span.bottom % Span::kPerTile];
         if ((columns | rows) < 2) {  // most are small: no branch to guess
@@ -162,7 +163,7 @@ void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next)
 template <class R>
 void Binning<R>::sort() {
     std::vector<std::vector<Pair>> halves{size_t(threads_)};
-    each_tile(threads_, tiles_, [&](int worker, int64_t tile) {
+    each_tile(threads_, tiles_, [&](int worker, int64_t tile, int64_t) {
         const int64_t first = begin[size_t(tile)];
         sort(pairs.get() + first, begin[size_t(tile) + 1] - first, halves[size_t(worker)]);
     });

@@ -13,12 +13,13 @@ namespace graings {
 inline int64_t pieces_of(int64_t count, int64_t piece) { return (count + piece - 1) / piece; }
 
 // Neighbours share Gaussians and lines of memory: a thread takes a run of tiles at a time, a short one where many threads
-// would else wait for the last.
+// would else wait for the last. visit(worker, tile, end of its run).
 template <class Visit>
 void each_tile(int threads, int64_t tiles, Visit visit) {
     const int64_t together = std::clamp<int64_t>(tiles / (16 * threads), 4, 16);
     parallel_for(threads, pieces_of(tiles, together), [&](int worker, int64_t piece) {
-        for (int64_t tile = piece * together; tile < std::min(tiles, (piece + 1) * together); tile++) visit(worker, tile);
+        const int64_t end = std::min(tiles, (piece + 1) * together);
+        for (int64_t tile = piece * together; tile < end; tile++) visit(worker, tile, end);
     });
 }
 
@@ -34,7 +35,7 @@ struct Piece {
 template <class R>
 class Binning {
 public:
-    Binning(const Camera&, bool compat, const Record<R>*, Span*, const double* depths, const int64_t* uids, int threads);
+    Binning(const Camera&, bool compat, int64_t gaussians, const Record<R>*, Span*, const double* depths, const int64_t* uids, int threads);
 
     // Counts the pairs of a piece whose begin, end and worker are known. A worker counts one piece at a time.
     void count(Piece&);
@@ -48,9 +49,10 @@ public:
     int64_t count() const { return count_; }
     Buffer<Pair> pairs;
     Buffer<int64_t> begin;  // of each tile's pairs; one more at the end
+    Buffer<uint32_t> places;  // of each Gaussian's pairs: where they begin; one more at the end
 
 private:
-    void enter(const Piece&, uint32_t place, uint32_t* next);
+    void enter(const Piece&, uint32_t first_place, uint32_t* next);
     void sort(Pair* pairs, int64_t count, std::vector<Pair>& half) const;
     uint32_t key(int64_t id) const;
 

@@ -1,19 +1,21 @@
 // An array without initialisation, aligned to a cache line.
 #pragma once
 #include <algorithm>
+#include <cstddef>
 #include <cstdlib>
 #include <memory>
 #include <new>
 
 namespace graings {
 
+inline size_t whole_lines(size_t bytes) { return (bytes + 63) / 64 * 64; }
+
 template <class T>
 class Buffer {
 public:
     Buffer() = default;
     explicit Buffer(size_t count) {
-        const size_t bytes = (std::max<size_t>(count, 1) * sizeof(T) + 63) / 64 * 64;
-        data_.reset(static_cast<T*>(std::aligned_alloc(64, bytes)));
+        data_.reset(static_cast<T*>(std::aligned_alloc(64, whole_lines(std::max<size_t>(count, 1) * sizeof(T)))));
         if (!data_) throw std::bad_alloc();
     }
     T* get() const { return data_.get(); }

@@ -138,13 +138,13 @@ GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, 
 GRAINGS_INLINE void put_spans(Span* spans, int64_t begin, int64_t end, D tiles, const D (&sides)[4]) {
 #if defined(__AVX512F__)
     if (begin + kGroup <= end) {
-        // four columns of 32 bits: nothing, the count, and the sides two by two
+        // three columns of 32 bits: the count, and the sides two by two
         const auto whole = [](D x) { return _mm512_cvttpd_epu32((__m512d)x.v); };
         const auto side = [&](const D& low, const D& high) { return whole(fma(splat<double, kGroup>(65536), high, low)); };
-        const __m512i a = _mm512_inserti32x8(_mm512_setzero_si512(), whole(tiles), 1);
-        const __m512i b = _mm512_inserti32x8(_mm512_castsi256_si512(side(sides[0], sides[1])), side(sides[2], sides[3]), 1);
-        for (int part = 0; part < 2; part++)
-            _mm512_storeu_ps(spans + begin + 4 * part, reordered<4, true>(_mm512_castsi512_ps(a), _mm512_castsi512_ps(b), part));
+        const __m512 a = _mm512_castsi512_ps(_mm512_inserti32x8(_mm512_castsi256_si512(whole(tiles)), side(sides[0], sides[1]), 1));
+        const __m512 b = _mm512_castsi512_ps(_mm512_castsi256_si512(side(sides[2], sides[3])));
+        float* to = reinterpret_cast<float*>(spans + begin);
+        _mm512_storeu_ps(to, reordered<3, true>(a, b, 0)), _mm256_storeu_ps(to + 16, _mm512_castps512_ps256(reordered<3, true>(a, b, 1)));
         return;
     }
 #endif
@@ -153,7 +153,7 @@ GRAINGS_INLINE void put_spans(Span* spans, int64_t begin, int64_t end, D tiles, 
     for (int i = 0; i < 4; i++) store(side[i], sides[i]);
     const auto block = [](double x) { return uint16_t(int32_t(x)); };
     for (int i = 0; i < kGroup && begin + i < end; i++)
-        spans[begin + i] = {0, uint32_t(int32_t(count[i])), block(side[0][i]), block(side[1][i]), block(side[2][i]), block(side[3][i])};
+        spans[begin + i] = {uint32_t(int32_t(count[i])), block(side[0][i]), block(side[1][i]), block(side[2][i]), block(side[3][i])};
 }
 
 // Small whole numbers of Gaussians begin..begin+7, as far as they come before the end.
@@ -172,7 +172,7 @@ GRAINGS_INLINE void put_bytes(uint8_t* bytes, int64_t begin, int64_t end, D numb
 // A pair's sums as they are added up, in as many numbers as lie between pairs.
 struct Sums { D first, rest; };
 
-// Adds a pair's sums if it has any. Half of the guesses whether it has are wrong, and each costs more than the addition.
+// Adds a pair's sums if there are `any`. Half of the guesses whether there are would be wrong, and each costs more than the addition.
 template <class R>
 GRAINGS_INLINE void add_sums(const R* of_pair, bool any, Sums& total) {
 #if defined(__AVX512F__)

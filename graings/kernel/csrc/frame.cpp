@@ -1,7 +1,9 @@
 #include "frame.hpp"
 
 #include <algorithm>
+#include <bit>
 #include <chrono>
+#include <cstring>
 #include <limits>
 #include <numeric>
 #include <stdexcept>
@@ -28,33 +30,62 @@ private:
 
 constexpr int64_t kPiece = 512;  // Gaussians handed to a thread at a time
 
+// `taken`: 0 or 1 for each place. How many there are before place `count` is known, too.
+Buffer<Ranks> ranked(const uint8_t* taken, int64_t count) {
+    Buffer<Ranks> ranks(size_t(count / 64 + 1));
+    uint32_t before = 0;
+    for (int64_t word = 0; word <= count / 64; word++) {
+        uint64_t bits = 0;
+        for (int64_t byte = 0; byte < 8; byte++) {
+            uint64_t eight = 0;  // eight flags in eight bytes, moved together by a product
+            const int64_t left = count - 64 * word - 8 * byte;
+            if (left > 0) std::memcpy(&eight, taken + 64 * word + 8 * byte, size_t(std::min<int64_t>(left, 8)));
+            bits |= eight * 0x0102040810204080 >> 56 << 8 * byte;
+        }
+        ranks[size_t(word)] = {bits, before};
+        before += uint32_t(std::popcount(bits));
+    }
+    return ranks;
+}
+
 }  // namespace
 
 template <class R>
 Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads, bool gradient)
     : camera_(camera), settings_(settings), count_(in.count),
       tiles_(pieces_of(camera.width, kTile) * pieces_of(camera.height, kTile)), status_(size_t(in.count)),
-      records_(size_t(in.count)), spans_(size_t(in.count)) {
+      records_(size_t(in.count)) {
     if (count_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::invalid_argument("more than 2^32 Gaussians");
     if (std::max(camera.width, camera.height) > kLongestSide) throw std::invalid_argument("an image may be at most " + std::to_string(kLongestSide) + " pixels wide and high");
     Stopwatch watch;
-    Buffer<double> depths{size_t(count_)};
-    Binning<R> binning(camera_, settings_.compat, records_.get(), spans_.get(), depths.get(), uids, threads);
-    const auto pieces = project({camera_, settings_, in, records_.get(), status_.get(), depths.get(), spans_.get(), out.means2d, out.radii}, binning, threads);
+    const size_t depths_end = whole_lines(size_t(count_) * sizeof(double)), light_end = size_t(tiles_) * kBlocks * kLanes * sizeof(R);
+    scratch_ = Buffer<std::byte>(std::max(depths_end + size_t(count_) * sizeof(Span), gradient ? 2 * light_end : 0));
+    double* depths = reinterpret_cast<double*>(scratch_.get());
+    Span* spans = reinterpret_cast<Span*>(scratch_.get() + depths_end);
+    Binning<R> binning(camera_, settings_.compat, count_, records_.get(), spans, depths, uids, threads);
+    const auto pieces = project({camera_, settings_, in, records_.get(), status_.get(), depths, spans, out.means2d, out.radii}, binning, threads);
     seconds_[kProject] = watch.lap();
     binning.enter(pieces);
     seconds_[kBin] = watch.lap();
     binning.sort();
-    pairs_ = std::move(binning.pairs), begin_ = std::move(binning.begin), pair_count_ = binning.count();
+    pairs_ = std::move(binning.pairs), begin_ = std::move(binning.begin), places_ = std::move(binning.places), pair_count_ = binning.count();
     seconds_[kSort] = watch.lap();
 
     const Kernels<R>& run = kernels<R>();
-    processed_ = Buffer<int32_t>(size_t(tiles_)), items_ = Buffer<int32_t>(size_t(tiles_));
-    if (gradient) light_ = Buffer<R>(size_t(tiles_) * kBlocks * kLanes), last_ = Buffer<R>(size_t(tiles_) * kBlocks * kLanes);
+    kept_ = Buffer<int32_t>(size_t(tiles_)), items_ = Buffer<int32_t>(size_t(tiles_));
+    if (gradient) light_ = reinterpret_cast<R*>(scratch_.get()), last_ = reinterpret_cast<R*>(scratch_.get() + light_end);
+    else scratch_ = {};
     TileArgs<R> tiles = tile_args(in.background);
     tiles.color = out.color, tiles.alpha = out.alpha, tiles.depth = out.depth;
+    Buffer<uint8_t> shown(gradient ? size_t(pair_count_) : 0);
+    if (gradient) tiles.shown = shown.get();
     Buffer<TileEntry<R>> chunks(size_t(threads) * kChunk);
-    each_tile(threads, tiles_, [&](int worker, int64_t tile) { run.draw_tile(tiles, tile, chunks.get() + worker * kChunk); });
+    each_tile(threads, tiles_, [&](int worker, int64_t tile, int64_t end) { run.draw_tile(tiles, tile, end, chunks.get() + worker * kChunk); });
+    if (gradient) {
+        ranks_ = ranked(shown.get(), pair_count_);
+        const Ranks& end = ranks_[size_t(pair_count_ / 64)];
+        shown_ = end.before + std::popcount(end.taken);
+    }
     seconds_[kBlend] = watch.lap();
 }
 
@@ -77,7 +108,7 @@ std::vector<Piece> Frame<R>::project(const ProjectArgs<R>& args, Binning<R>& bin
 
 template <class R>
 TileArgs<R> Frame<R>::tile_args(const R* background) const {
-    return {camera_, settings_, background, records_.get(), begin_.get(), pairs_.get(), processed_.get(), items_.get(), light_.get(), last_.get(), nullptr, nullptr, nullptr};
+    return {camera_, settings_, background, records_.get(), begin_.get(), pairs_.get(), kept_.get(), items_.get(), nullptr, light_, last_, nullptr, nullptr, nullptr};
 }
 
 template <class R>
@@ -86,28 +117,34 @@ int64_t Frame<R>::evaluated() const {
 }
 
 template <class R>
-void Frame<R>::gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha, const R* v_depth, const Gradients<R>& out, int threads) const {
-    if (in.count != count_) throw std::invalid_argument("the gradient needs the Gaussians of the forward pass");
-    if (!light_.get()) throw std::invalid_argument("this frame was drawn without a gradient in mind");
-    const Kernels<R>& run = kernels<R>();
+void Frame<R>::pixels_gradient(const R* background, const R* v_color, const R* v_alpha, const R* v_depth, R* v_background, int threads) {
+    if (!has_gradient()) throw std::logic_error("this frame was drawn without a gradient in mind, or has given it already");
     Stopwatch watch;
-    Buffer<R> sums(size_t(pair_count_) * kSumStride);
-    Buffer<uint8_t> written{size_t(pair_count_)};
-    Buffer<double> v_background(out.background ? size_t(tiles_) * 3 : 0);
-    const TileGradientArgs<R> tiles{tile_args(in.background), v_color, v_alpha, v_depth, sums.get(), written.get(), out.background ? v_background.get() : nullptr};
-    each_tile(threads, tiles_, [&](int, int64_t tile) { run.tile_gradient(tiles, tile); });
-    if (out.background) {
+    sums_ = Buffer<R>(size_t(shown_) * kSumStride);
+    Buffer<double> grounds(v_background ? size_t(tiles_) * 3 : 0);
+    const TileGradientArgs<R> tiles{tile_args(background), v_color, v_alpha, v_depth, ranks_.get(), sums_.get(), v_background ? grounds.get() : nullptr};
+    each_tile(threads, tiles_, [&](int, int64_t tile, int64_t) { kernels<R>().tile_gradient(tiles, tile); });
+    if (v_background) {
         double ground[3] = {};
         for (int64_t tile = 0; tile < tiles_; tile++)
-            for (int c = 0; c < 3; c++) ground[c] += v_background[size_t(3 * tile + c)];
-        for (int c = 0; c < 3; c++) out.background[c] = R(ground[c]);
+            for (int c = 0; c < 3; c++) ground[c] += grounds[size_t(3 * tile + c)];
+        for (int c = 0; c < 3; c++) v_background[c] = R(ground[c]);
     }
+    records_ = {}, pairs_ = {}, scratch_ = {}, light_ = last_ = nullptr;
     seconds_[kBlendGradient] = watch.lap();
-    const GeometryGradientArgs<R> geometry{camera_, settings_, in, status_.get(), spans_.get(), sums.get(), written.get(),
+}
+
+template <class R>
+void Frame<R>::gaussians_gradient(const Inputs<R>& in, const Gradients<R>& out, int threads) {
+    if (in.count != count_) throw std::invalid_argument("the gradient needs the Gaussians of the forward pass");
+    if (!sums_.get()) throw std::logic_error("the gradient of the Gaussians needs that of the pixels");
+    Stopwatch watch;
+    const GeometryGradientArgs<R> geometry{camera_, settings_, in, status_.get(), places_.get(), ranks_.get(), sums_.get(),
                                            out.means, out.quats, out.log_scales, out.opacities, out.colors, out.offset};
     parallel_for(threads, pieces_of(count_, kPiece), [&](int, int64_t piece) {
-        run.geometry_gradient(geometry, piece * kPiece, std::min(count_, (piece + 1) * kPiece));
+        kernels<R>().geometry_gradient(geometry, piece * kPiece, std::min(count_, (piece + 1) * kPiece));
     });
+    sums_ = {}, places_ = {}, ranks_ = {}, status_ = {};
     seconds_[kGeometryGradient] = watch.lap();
 }
 

@@ -1,4 +1,4 @@
-// One drawn view: runs the stages of the forward pass and keeps what the gradient needs.
+// One drawn view: runs the stages of the forward pass and keeps what the gradient needs, until it is asked for.
 #pragma once
 #include <vector>
 #include "binning.hpp"
@@ -14,7 +14,7 @@ struct Outputs {
 
 template <class R>
 struct Gradients {
-    R *means, *quats, *log_scales, *opacities, *colors, *background, *offset;  // the last two may be null
+    R *means, *quats, *log_scales, *opacities, *colors, *offset;  // the last one may be null
 };
 
 enum Stage { kProject, kBin, kSort, kBlend, kBlendGradient, kGeometryGradient, kStages };
@@ -25,8 +25,16 @@ public:
     // `uids` break ties of depth. Keeps no pointer into `in` or `out`, and what a gradient needs only if there will be one.
     Frame(const Camera&, const Settings&, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads, bool gradient);
 
-    // `in` must hold the same values as in the forward pass. v_alpha, v_depth may be null.
-    void gradient(const Inputs<R>& in, const R* v_color, const R* v_alpha, const R* v_depth, const Gradients<R>& out, int threads) const;
+    // The gradient has two halves, one after the other, each once: what was kept is given back on the way.
+    // First that of the pixels: what every Gaussian adds up to, and that of the background. v_alpha, v_depth and
+    // v_background may be null.
+    void pixels_gradient(const R* background, const R* v_color, const R* v_alpha, const R* v_depth, R* v_background, int threads);
+
+    // Then that of the Gaussians. `in` must hold the same values as in the forward pass.
+    void gaussians_gradient(const Inputs<R>& in, const Gradients<R>& out, int threads);
+
+    // Whether there is a gradient to be had: there was to be one, and nobody has asked yet.
+    bool has_gradient() const { return light_; }
 
     const int64_t* statuses() const { return statuses_; }
     int64_t pairs() const { return pair_count_; }
@@ -41,14 +49,18 @@ private:
     Settings settings_;
     int64_t count_, tiles_, pair_count_ = 0;
     int64_t statuses_[kStatuses] = {};
-    mutable double seconds_[kStages] = {};
+    double seconds_[kStages] = {};
     Buffer<uint8_t> status_;
     Buffer<Record<R>> records_;
-    Buffer<Span> spans_;
+    Buffer<uint32_t> places_;
     Buffer<int64_t> begin_;
     Buffer<Pair> pairs_;
-    Buffer<int32_t> processed_, items_;
-    Buffer<R> light_, last_;
+    Buffer<int32_t> kept_, items_;
+    Buffer<Ranks> ranks_;
+    int64_t shown_ = 0;  // pairs
+    Buffer<std::byte> scratch_;  // of the Gaussians while they are binned, then of the pixels: never both
+    R *light_ = nullptr, *last_ = nullptr;
+    Buffer<R> sums_;
 };
 
 }  // namespace graings

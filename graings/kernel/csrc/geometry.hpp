@@ -2,6 +2,7 @@
 // Formulas: sheared footprint (a determinant without a subtraction) and its adjoint.
 #pragma once
 #include "columns.hpp"
+#include "ranks.hpp"
 #include "types.hpp"
 
 namespace graings::GRAINGS_ISA {
@@ -182,19 +183,21 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         alignas(64) double sums[kGroup][kSumStride];
         double on_[kGroup];
         bool drawn = false;
+        uint32_t first = rank(args.ranks, args.places[group]);  // of a Gaussian's pairs
         for (int lane = 0; lane < kGroup; lane++) {
             const int64_t i = group + lane < end ? group + lane : end - 1;
             const bool own = group + lane < end && args.status[i] == kDrawn;
             on_[lane] = own, drawn |= own;
-            const uint32_t count = own ? args.spans[i].count : 0, first = count ? args.spans[i].begin : 0;
+            const uint32_t next = own ? rank(args.ranks, args.places[i + 1]) : first, count = next - first;
             Sums total{d8(0), d8(0)};
-            const auto add = [&](uint32_t place, bool there) {
-                const R* of_pair = args.sums + int64_t(place) * kSumStride;
+            const auto add = [&](uint32_t at, bool there) {
+                const R* of_pair = args.sums + int64_t(at) * kSumStride;
                 __builtin_prefetch(of_pair + kSumsAhead * kSumStride);
-                add_sums(of_pair, bool(args.written[place]) & there, total);
+                add_sums(of_pair, there, total);
             };
             add(first, count > 0), add(first + (count > 1), count > 1);  // most have no more: no branch to guess
-            for (uint32_t place = first + 2; place < first + count; place++) add(place, true);
+            for (uint32_t at = first + 2; at < next; at++) add(at, true);
+            first = next;
             store(sums[lane], total.first), store(sums[lane] + kGroup, total.rest);
         }
         const D none[4] = {d8(0), d8(0), d8(0), d8(0)};

@@ -2,6 +2,7 @@
 // pass, so that the light before an entry is the light behind it divided by 1 - alpha; what a pixel sees behind an entry
 // follows from a convex recurrence.
 #pragma once
+#include "ranks.hpp"
 #include "tiles.hpp"
 
 namespace graings::GRAINGS_ISA {
@@ -97,9 +98,13 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     for (int b = 0; b < kBlocks; b++)
         for (int c = 0; c < kChannels; c++) heard |= uint32_t(any_set(up[c][b])) << b;
 
-    const int n = heard ? args.processed[tile] : 0;
-    for (int64_t k = begin + n; k < end; k++) all.written[args.pairs[k].place] = 0;
-    if (!heard) return;
+    const auto sums_of = [&](uint32_t place) { return all.sums + size_t(rank(all.ranks, place)) * kSumStride; };
+    const auto put_nothing = [&](uint32_t place) { std::memset(sums_of(place), 0, kSums * sizeof(R)); };
+    const int n = args.kept[tile];
+    if (!heard) {
+        for (int64_t k = begin; k < begin + n; k++) put_nothing(args.pairs[k].place);
+        return;
+    }
 
     // what a pixel sees behind the current entry, weighed by its upstream: starts at the background
     alignas(64) R light[kBlocks][kLanes], behind[kBlocks][kLanes];
@@ -161,17 +166,16 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     int readied = 0, taken = 0;
     const Pair* entries = args.pairs + begin;
     const auto record_of = [&](int j) -> const Record<R>& { return args.records[entries[j].id]; };
-    const auto sums_of = [&](int j) { return all.sums + size_t(entries[j].place) * kSumStride; };
 
     const auto make_ready = [&](int j) {
-        if (entries[j].mask & heard) prepare(ready[readied++ % kReady], record_of(j), double(box.left), double(box.top), j);
+        if (entries[j].mask & heard) prepare(ready[readied++ % kReady], record_of(j), double(box.left), double(box.top), entries[j].key);
     };
     for (int j = n - 1; j >= 0 && j > n - 1 - kReadyAhead; j--) make_ready(j);
 
     const auto clear = [&](Totals& t) { t.e = t.er = t.es = t.err = t.ers = t.ess = t.red = t.green = t.blue = t.depth = zero; };
     const auto put = [&](const Totals& total, int j) {
         const P<R> totals[kSums] = {total.e, total.er, total.es, total.err, total.ers, total.ess, total.red, total.green, total.blue, Extra ? total.depth : zero};
-        add_lanes(totals, sums_of(j));
+        add_lanes(totals, sums_of(entries[j].place));
     };
     // Where there are registers enough, a block is looked at before the one looked at last is added up, so that neither
     // waits for the other.
@@ -188,10 +192,12 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     for (int j = n - 1; j >= 0; j--) {
         if (j >= kRecordAhead) __builtin_prefetch(&record_of(j - kRecordAhead));
         if (j >= kReadyAhead) make_ready(j - kReadyAhead);
-        if (!kStreamed<R> && j >= kSumsAhead) __builtin_prefetch(sums_of(j - kSumsAhead), 1);
+        if (!kStreamed<R> && j >= kSumsAhead) __builtin_prefetch(sums_of(entries[j - kSumsAhead].place), 1);
         uint32_t mask = entries[j].mask & heard;
-        all.written[entries[j].place] = mask != 0;
-        if (!mask) continue;
+        if (!mask) {
+            put_nothing(entries[j].place);
+            continue;
+        }
         const TileEntry<R>& entry = ready[taken++ % kReady];
         if constexpr (kOverlap) {
             Seen next = look(entry, mask);

@@ -106,7 +106,6 @@ GRAINGS_INLINE TileBox tile_box(const Camera& k, int64_t tile) {
     const int64_t w = k.width - left, h = k.height - top;
     return {left, top, w < kTile ? w : kTile, h < kTile ? h : kTile};
 }
-GRAINGS_INLINE int64_t tiles_of(const Camera& k) { return ((k.width + kTile - 1) / kTile) * ((k.height + kTile - 1) / kTile); }
 GRAINGS_INLINE int lane_x(int block, int lane) { return (block & 3) * 4 + (lane & 3); }
 GRAINGS_INLINE int lane_y(int block, int lane) { return (block >> 2) * 4 + (lane >> 2); }
 
@@ -174,7 +173,7 @@ GRAINGS_INLINE void to_rows(const R (*blocks)[kBlocks][kLanes], const TileBox& b
 constexpr int kSmall = 3;  // entries that touch fewer blocks, on average, are small
 
 template <class R, bool Compat, bool Keep, bool Depth>
-GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
+GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end, TileEntry<R>* chunk) {
     const TileBox box = tile_box(args.camera, tile);
     const Rule<R> limits = rule<R>(args.settings);
     const P<R> rows = load<kLanes>(kRows<R>);
@@ -186,8 +185,9 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
     std::memset(channels, 0, sizeof channels);
 
     int64_t k = args.begin[tile];
-    const int64_t end = args.begin[tile + 1], start = k, pairs = args.begin[tiles_of(args.camera)];
+    const int64_t end = args.begin[tile + 1], start = k, soon_end = args.begin[next_end];
     int32_t items = 0;
+    int64_t kept = k;
     while (k < end && live) {
         const int n = int(end - k < kChunk ? end - k : kChunk);
         uint16_t masks[kChunk] = {};
@@ -195,7 +195,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
         int touched = 0;  // blocks, by all entries
         for (int j = 0; j < n; j++) {
             Pair& pair = args.pairs[k + j];
-            if (k + j + kChunk < pairs) __builtin_prefetch(&args.records[args.pairs[k + j + kChunk].id]);  // maybe the next tile's
+            if (k + j + kChunk < soon_end) __builtin_prefetch(&args.records[args.pairs[k + j + kChunk].id]);  // maybe the next tile's
             if (pair.mask &= live) {
                 prepare(chunk[j], args.records[pair.id], double(box.left), double(box.top), k + j - start);
                 if constexpr (!Compat) pair.mask &= reached_blocks(chunk[j]);
@@ -253,9 +253,18 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
         } else
             for (int b = 0; b < kBlocks; b++)
                 if (lists[b]) walk(b, std::false_type());
+        if (Keep && args.shown)  // what the gradient has to look at moves together
+            for (int j = 0; j < n; j++) {
+                const Pair& pair = args.pairs[k + j];
+                args.shown[pair.place] = pair.mask != 0;
+                args.pairs[kept] = {uint32_t(k + j - start), pair.id, pair.place, pair.mask};
+                kept += pair.mask != 0;
+            }
         k += n;
     }
-    args.processed[tile] = int32_t(k - start);
+    if (Keep && args.shown)
+        for (int64_t rest = k; rest < end; rest++) args.shown[args.pairs[rest].place] = 0;
+    args.kept[tile] = int32_t(kept - start);
     args.items[tile] = items;
     if (Keep && args.light) {
         std::memcpy(args.light + tile * kBlocks * kLanes, light, sizeof light);
@@ -275,7 +284,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, TileEntry<R>* ch
 // A tile that nothing touches.
 template <class R>
 GRAINGS_INLINE void draw_background(const TileArgs<R>& args, int64_t tile) {
-    args.processed[tile] = args.items[tile] = 0;
+    args.kept[tile] = args.items[tile] = 0;
     R color[3 * kTile];
     const R nothing[kTile] = {};
     for (int i = 0; i < 3 * kTile; i++) color[i] = args.background[i % 3];
@@ -288,17 +297,17 @@ GRAINGS_INLINE void draw_background(const TileArgs<R>& args, int64_t tile) {
 }
 
 template <class R, bool Depth>
-GRAINGS_INLINE void draw_some(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
-    if (args.settings.compat) draw<R, true, true, Depth>(args, tile, chunk);
-    else if (args.light) draw<R, false, true, Depth>(args, tile, chunk);
-    else draw<R, false, false, Depth>(args, tile, chunk);
+GRAINGS_INLINE void draw_some(const TileArgs<R>& args, int64_t tile, int64_t next_end, TileEntry<R>* chunk) {
+    if (args.settings.compat) draw<R, true, true, Depth>(args, tile, next_end, chunk);
+    else if (args.light) draw<R, false, true, Depth>(args, tile, next_end, chunk);
+    else draw<R, false, false, Depth>(args, tile, next_end, chunk);
 }
 
 template <class R>
-static void draw_tile(const TileArgs<R>& args, int64_t tile, TileEntry<R>* chunk) {
+static void draw_tile(const TileArgs<R>& args, int64_t tile, int64_t next_end, TileEntry<R>* chunk) {
     if (args.begin[tile] == args.begin[tile + 1]) draw_background(args, tile);
-    else if (args.depth) draw_some<R, true>(args, tile, chunk);
-    else draw_some<R, false>(args, tile, chunk);
+    else if (args.depth) draw_some<R, true>(args, tile, next_end, chunk);
+    else draw_some<R, false>(args, tile, next_end, chunk);
 }
 
 }  // namespace graings::GRAINGS_ISA

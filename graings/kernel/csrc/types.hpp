@@ -42,10 +42,9 @@ struct alignas(64) Record {
 };
 static_assert(sizeof(Record<float>) == 64);
 
-// The rectangle of blocks that a Gaussian may touch, from the image's left and top, and its pairs with tiles: how many
-// there are and where their places begin.
+// The rectangle of blocks that a Gaussian may touch, from the image's left and top, and how many pairs with tiles it has.
 struct Span {
-    uint32_t begin, count;
+    uint32_t count;
     uint16_t left, right, top, bottom;
     static constexpr int kPerTile = kTile / kBlock;
     uint32_t first_column() const { return left / kPerTile; }
@@ -58,10 +57,16 @@ struct Span {
 
 // A Gaussian on a tile.
 struct Pair {
-    uint32_t key;    // of its depth
+    uint32_t key;    // of its depth; once drawn, its number in the tile
     uint32_t id;
-    uint32_t place;  // where its sums go: contiguous per Gaussian
+    uint32_t place;  // in the Gaussians' order: its number among the pairs of all
     uint32_t mask;   // blocks of the tile that it may touch, one bit each
+};
+
+// Of 64 places: which are taken, and how many are before the first of them.
+struct Ranks {
+    uint64_t taken;
+    uint32_t before;
 };
 
 // A record seen from one tile. The scaled distances of a block's pixel are r = r[block] + lanes[pixel] and
@@ -90,7 +95,7 @@ struct ProjectArgs {
     Record<R>* records;
     uint8_t* status;
     double* depths;
-    Span* spans;  // all but `begin`; the count is that of all tiles in the rectangle
+    Span* spans;  // the count is that of all tiles in the rectangle
     R *means2d, *radii;
 };
 
@@ -102,9 +107,10 @@ struct TileArgs {
     const R* background;
     const Record<R>* records;
     const int64_t* begin;
-    Pair* pairs;          // masks: once drawn, the blocks that were still open, less those found to show nothing of it
-    int32_t* processed;   // entries per tile that were looked at before every pixel had stopped
+    Pair* pairs;          // for the gradient, those shown move to the front, with their number in the tile as key
+    int32_t* kept;        // entries per tile that were shown: by a block whose pixels had not all stopped
     int32_t* items;       // (entry, block) pairs per tile
+    uint8_t* shown;       // [place] for the gradient, or null: whether a block has shown the pair
     R *light, *last;      // [tile, block, lane] for the gradient, or null: what passes all entries, and the number of
                           // the last entry of the tile that counted
     R *color, *alpha, *depth;  // depth may be null
@@ -114,8 +120,8 @@ template <class R>
 struct TileGradientArgs {
     TileArgs<R> tiles;
     const R *v_color, *v_alpha, *v_depth;  // the last two may be null
-    R* sums;                           // [pair, kSums]
-    uint8_t* written;                  // [pair]: whether there are sums; there are none where all are 0
+    const Ranks* ranks;                // of the places of pairs that were shown
+    R* sums;                           // [rank, kSums], of those alone
     double* v_background;              // [tile, 3] or null
 };
 
@@ -125,9 +131,9 @@ struct GeometryGradientArgs {
     Settings settings;
     Inputs<R> in;
     const uint8_t* status;
-    const Span* spans;          // per Gaussian
+    const uint32_t* places;     // of each Gaussian's pairs: where they begin; one more at the end
+    const Ranks* ranks;         // of the places of pairs that were shown
     const R* sums;
-    const uint8_t* written;
     R *v_means, *v_quats, *v_log_scales, *v_opacities, *v_colors, *v_offset;  // v_offset may be null
 };
 
@@ -170,7 +176,7 @@ struct NetworkArgs {
 template <class R>
 struct Kernels {
     void (*project)(const ProjectArgs<R>&, int64_t begin, int64_t end);
-    void (*draw_tile)(const TileArgs<R>&, int64_t tile, TileEntry<R>* chunk);
+    void (*draw_tile)(const TileArgs<R>&, int64_t tile, int64_t next_end, TileEntry<R>* chunk);  // the same thread draws those before next_end
     void (*tile_gradient)(const TileGradientArgs<R>&, int64_t tile);
     void (*geometry_gradient)(const GeometryGradientArgs<R>&, int64_t begin, int64_t end);
     void (*ssim_values)(const SsimArgs<R>&, int64_t band, int64_t begin, int64_t end, R* scratch);
