@@ -30,16 +30,15 @@ private:
 
 constexpr int64_t kPiece = 512;  // Gaussians handed to a thread at a time
 
-// `taken`: 0 or 1 for each place. How many there are before place `count` is known, too.
-Buffer<Ranks> ranked(const uint8_t* taken, int64_t count) {
-    Buffer<Ranks> ranks(size_t(count / 64 + 1));
+// `taken`: 0 or 1 for each of `words` times 64 places.
+Buffer<Ranks> ranked(const uint8_t* taken, int64_t words) {
+    Buffer<Ranks> ranks{size_t(words)};
     uint32_t before = 0;
-    for (int64_t word = 0; word <= count / 64; word++) {
+    for (int64_t word = 0; word < words; word++) {
         uint64_t bits = 0;
-        for (int64_t byte = 0; byte < 8; byte++) {
-            uint64_t eight = 0;  // eight flags in eight bytes, moved together by a product
-            const int64_t left = count - 64 * word - 8 * byte;
-            if (left > 0) std::memcpy(&eight, taken + 64 * word + 8 * byte, size_t(std::min<int64_t>(left, 8)));
+        for (int byte = 0; byte < 8; byte++) {
+            uint64_t eight;  // flags, each in a byte of its own: a product moves them together
+            std::memcpy(&eight, taken + 64 * word + 8 * byte, sizeof eight);
             bits |= eight * 0x0102040810204080 >> 56 << 8 * byte;
         }
         ranks[size_t(word)] = {bits, before};
@@ -77,13 +76,14 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
     else scratch_ = {};
     TileArgs<R> tiles = tile_args(in.background);
     tiles.color = out.color, tiles.alpha = out.alpha, tiles.depth = out.depth;
-    Buffer<uint8_t> shown(gradient ? size_t(pair_count_) : 0);
-    if (gradient) tiles.shown = shown.get();
+    const int64_t words = pair_count_ / 64 + 1;  // how many were shown before the end is asked for, too
+    Buffer<uint8_t> shown(gradient ? size_t(64 * words) : 0);
+    if (gradient) tiles.shown = shown.get(), std::fill(shown.get() + pair_count_, shown.get() + 64 * words, uint8_t(0));
     Buffer<TileEntry<R>> chunks(size_t(threads) * kChunk);
     each_tile(threads, tiles_, [&](int worker, int64_t tile, int64_t end) { run.draw_tile(tiles, tile, end, chunks.get() + worker * kChunk); });
     if (gradient) {
-        ranks_ = ranked(shown.get(), pair_count_);
-        const Ranks& end = ranks_[size_t(pair_count_ / 64)];
+        ranks_ = ranked(shown.get(), words);
+        const Ranks& end = ranks_[size_t(words - 1)];
         shown_ = end.before + std::popcount(end.taken);
     }
     seconds_[kBlend] = watch.lap();
