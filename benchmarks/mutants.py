@@ -68,7 +68,7 @@ class Mutant:
 
 
 GEOMETRY, BINNING = f"{SOURCE}/geometry.hpp", f"{SOURCE}/binning.cpp"
-TILES, TILE_GRADIENT = f"{SOURCE}/tiles.hpp", f"{SOURCE}/tile_gradient.hpp"
+TILES, TILE_GRADIENT, RANKS = (f"{SOURCE}/{name}.hpp" for name in ("tiles", "tile_gradient", "ranks"))
 SCENE = ("tests/scene",)
 
 MUTANTS = (
@@ -159,10 +159,10 @@ MUTANTS = (
     ),
     Mutant(
         "l",
-        "sums taken for written behind the last entry seen",
-        TILE_GRADIENT,
-        "for (int64_t k = begin + n; k < end; k++) all.written[args.pairs[k].place] = 0;",
-        "",
+        "what lies behind the last entry seen not said to be unseen",
+        TILES,
+        "for (int64_t rest = k; rest < end; rest++) args.shown[args.pairs[rest].place] = 0;",
+        ";",
     ),
     Mutant(
         "m", "sign of the sum of s flipped", TILE_GRADIENT, "total.es = total.es + ge_s", "total.es = total.es - ge_s"
@@ -232,17 +232,38 @@ MUTANTS = (
     ),
     Mutant(
         "place-lost",
-        "the third of a Gaussian's places forgotten",
+        "the third of a Gaussian's sums forgotten",
         GEOMETRY,
-        "for (uint32_t place = first + 2;",
-        "for (uint32_t place = first + 3;",
+        "for (uint32_t at = first + 2;",
+        "for (uint32_t at = first + 3;",
     ),
     Mutant(
         "unwritten",
-        "sums taken where none were written",
-        GEOMETRY,
-        "add_sums(of_pair, bool(args.written[place]) & there, total);",
-        "add_sums(of_pair, there, total);",
+        "sums of entries whose blocks have no say not written",
+        TILE_GRADIENT,
+        "put_nothing(entries[j].place);",
+        "",
+    ),
+    Mutant(
+        "unwritten-tile",
+        "sums of a tile whose blocks have no say not written",
+        TILE_GRADIENT,
+        "put_nothing(args.pairs[k].place);",
+        ";",
+    ),
+    Mutant(
+        "renumbered",
+        "entries numbered among those shown, not among all",
+        TILE_GRADIENT,
+        "double(box.top), entries[j].key);",
+        "double(box.top), j);",
+    ),
+    Mutant(
+        "rank",
+        "a place counted among those before it",
+        RANKS,
+        "((uint64_t(1) << place % 64) - 1)",
+        "((uint64_t(2) << place % 64) - 1)",
     ),
     Mutant(
         "reason",
