@@ -260,10 +260,10 @@ MUTANTS = (
     ),
     Mutant(
         "rank",
-        "a place counted among those before it",
+        "the nearest place before one not counted",
         RANKS,
         "((uint64_t(1) << place % 64) - 1)",
-        "((uint64_t(2) << place % 64) - 1)",
+        "(((uint64_t(1) << place % 64) - 1) >> 1)",
     ),
     Mutant(
         "reason",
