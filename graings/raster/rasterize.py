@@ -151,14 +151,16 @@ class _Rasterize(torch.autograd.Function):
         means, quats, log_scales, opacities, colors, ground, shift, _ = ctx.saved_tensors
         inputs = (means, quats, log_scales, opacities, colors)
         camera, settings = ctx.view
-        if not ctx.frame.has_gradient:  # of a graph that was retained: the frame gave its memory back the first time
-            ctx.frame, _ = _draw(ctx.saved_tensors, camera, settings, False, ctx.threads, gradient=True)
+        # A frame has one gradient to give. Of a retained graph, who comes second or at the same time draws again.
+        frame = ctx.__dict__.pop("frame", None)
+        if frame is None:
+            frame, _ = _draw(ctx.saved_tensors, camera, settings, False, ctx.threads, gradient=True)
         upstream = means.new_zeros(camera.height, camera.width, 3) if v_color is None else v_color
         upstreams = [_prepared(v) for v in (upstream, v_alpha, v_depth)]
         v_ground = torch.empty_like(ground) if ctx.needs_input_grad[len(inputs)] else None
-        ctx.frame.pixels_gradient(*_addresses(ground, *upstreams, v_ground), ctx.threads)
+        frame.pixels_gradient(*_addresses(ground, *upstreams, v_ground), ctx.threads)
         # only now: they find room where the frame kept what it has given back
         gradients = [torch.empty_like(tensor) for tensor in inputs]
         v_shift = None if shift is None else torch.empty_like(shift)
-        ctx.frame.gaussians_gradient(len(means), *_addresses(*inputs, ground, shift, *gradients, v_shift), ctx.threads)
+        frame.gaussians_gradient(len(means), *_addresses(*inputs, ground, shift, *gradients, v_shift), ctx.threads)
         return (*gradients, v_ground, v_shift, None, None, None, None, None)

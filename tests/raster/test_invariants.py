@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -233,6 +234,22 @@ def test_a_retained_graph_gives_every_gradient_as_if_it_were_the_first(dtype: to
         for again, first in zip(gradients(kept, seed), gradients(images(), seed), strict=True):
             assert torch.equal(again, first)
             assert first.abs().sum() > 0
+
+
+def test_threads_that_ask_one_graph_at_once_all_get_its_gradient() -> None:
+    batch, camera = cast(gaussians(2_000, 32), torch.float32), pinhole()
+    leaves = {name: getattr(batch, name).clone().requires_grad_() for name in FLOATS}
+    color = rasterize(replace(batch, **leaves), camera, torch.tensor(BACKGROUND)).color
+    cotangent = upstream(camera).float()[..., :3]
+
+    def gradients() -> tuple[Tensor, ...]:
+        return torch.autograd.grad(color, list(leaves.values()), cotangent, retain_graph=True)
+
+    with ThreadPoolExecutor(4) as pool:
+        found = [asked.result() for asked in [pool.submit(gradients) for _ in range(40)]]
+    for name, *answers in zip(leaves, *found, strict=True):
+        assert answers[0].abs().sum() > 0, name
+        assert all(torch.equal(answer, answers[0]) for answer in answers[1:]), name
 
 
 def test_drawing_works_in_inference_mode() -> None:

@@ -149,7 +149,6 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         }, "of each stage")
         .def_prop_ro("pairs", &Frame<R>::pairs, "(tile, Gaussian) pairs")
         .def_prop_ro("evaluated", &Frame<R>::evaluated, "(pixel, Gaussian) pairs that were looked at")
-        .def_prop_ro("has_gradient", &Frame<R>::has_gradient, "whether there is one, and nobody has asked for it yet")
         .def("pixels_gradient",
              [](Frame<R>& frame, Address background, Address v_color, Address v_alpha, Address v_depth, Address g_background, int threads) {
                  const R *ground = needed<R>(background, 1, "background"), *color = needed<R>(v_color, 1, "v_color");

@@ -118,7 +118,7 @@ int64_t Frame<R>::evaluated() const {
 
 template <class R>
 void Frame<R>::pixels_gradient(const R* background, const R* v_color, const R* v_alpha, const R* v_depth, R* v_background, int threads) {
-    if (!has_gradient()) throw std::logic_error("this frame was drawn without a gradient in mind, or has given it already");
+    if (!light_) throw std::logic_error("this frame was drawn without a gradient in mind, or has given it already");
     Stopwatch watch;
     sums_ = Buffer<R>(size_t(shown_) * kSumStride);
     Buffer<double> grounds(v_background ? size_t(tiles_) * 3 : 0);

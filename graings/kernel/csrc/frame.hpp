@@ -33,9 +33,6 @@ public:
     // Then that of the Gaussians. `in` must hold the same values as in the forward pass.
     void gaussians_gradient(const Inputs<R>& in, const Gradients<R>& out, int threads);
 
-    // Whether there is a gradient to be had: there was to be one, and nobody has asked yet.
-    bool has_gradient() const { return light_; }
-
     const int64_t* statuses() const { return statuses_; }
     int64_t pairs() const { return pair_count_; }
     int64_t evaluated() const;  // pairs of pixel and Gaussian
