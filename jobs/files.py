@@ -24,7 +24,19 @@ def write_json(path: Path, value: Any) -> None:
 
 def sync_folder(path: Path) -> None:
     """Have the disk know what the folder holds: without it, a rename may be undone when the power fails."""
-    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    _sync(path)
+
+
+def sync_tree(path: Path) -> None:
+    """Have the disk know the folder, the folders in it, and what is written in their files."""
+    for folder, _, files in os.walk(path):
+        for name in files:
+            _sync(Path(folder, name))
+        _sync(Path(folder))
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(handle)
     finally:

@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from graings.run_folder import MODEL_FILE, newest_checkpoint
-from jobs.files import locked, sync_folder, write_json
+from jobs.files import locked, sync_folder, sync_tree, write_json
 from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
 
 LOG = logging.getLogger(__name__)
@@ -140,6 +140,7 @@ class Store:
         """A new job whose capture lies in the folder `unpacked`, which is moved into the store. Returns its id."""
         now = time.time()
         job_id = f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
+        sync_tree(unpacked)  # a job that the disk remembers must not have lost its images
         with self._changing():
             capture = self._captures / spec.capture
             if _files(capture) == _files(unpacked):

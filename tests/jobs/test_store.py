@@ -191,17 +191,24 @@ def test_an_old_job_that_is_being_deleted_is_no_leftover(tmp_path: Path, monkeyp
 
 
 def test_a_new_job_is_on_the_disk_before_anyone_hears_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A rename that only the memory knows of is lost with the power: its folder must be synced after it."""
+    """What only the memory knows of is lost with the power: the images, and renames unless their folder is synced."""
     store = Store(tmp_path)
+    capture = unpacked(store, "u", "a.json", "images/b.png")
+    written = {(path.stat().st_ino, path.stat().st_size) for path in capture.rglob("*") if path.is_file()}
     synced: list[tuple[int, list[str]]] = []
+    files: set[tuple[int, int]] = set()  # before the capture is where it belongs
 
     def fsync(handle: int) -> None:
-        inode = os.fstat(handle).st_ino
-        if stat.S_ISDIR(os.fstat(handle).st_mode):
-            synced.append((inode, os.listdir(handle)))
+        found = os.fstat(handle)
+        if stat.S_ISDIR(found.st_mode):
+            synced.append((found.st_ino, os.listdir(handle)))
+        elif not any((tmp_path / "captures").iterdir()):
+            files.add((found.st_ino, found.st_size))
 
     monkeypatch.setattr(os, "fsync", fsync)
-    job_id = store.create(spec(), unpacked(store, "u", "a.json"))
+    job_id = store.create(spec(), capture)
+    assert len(written) == 2 and written <= files
+    assert (store.capture(DIGEST).joinpath("images").stat().st_ino, ["b.png"]) in synced
     assert ((tmp_path / "captures").stat().st_ino, [DIGEST]) in synced
     assert (store.folder(job_id).path.stat().st_ino, ["job.json"]) in synced
     assert synced[-1] == ((tmp_path / "jobs").stat().st_ino, [job_id])
