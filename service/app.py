@@ -43,7 +43,7 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=lifespan,
     )
     app.add_middleware(BodyLimit, limit=limit)
-    app.add_middleware(SameOrigin)
+    app.add_middleware(SameOrigin, names=settings.answers_to)
     problems.install(app)
     for routes in (jobs, results, render, system):
         app.include_router(routes.router)

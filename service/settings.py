@@ -25,6 +25,11 @@ class Settings(BaseModel):
     data: Path = Field(Path("data"), description="Folder with captures and jobs.")
     database: str | None = Field(None, description="sqlite:///… or postgresql://…; null: SQLite in the data folder.")
     host: str = Field("127.0.0.1", description="Address to listen on. There is no authentication: keep it local.")
+    names: str = Field(
+        "localhost",
+        description="Names by which it may be asked for, beside addresses, with commas between them; * for any. "
+        "Others may belong to a page that leads its own name here.",
+    )
     port: int = Field(8000, ge=0, le=65535, description="Port to listen on.")
     max_upload_mb: int = Field(4_096, ge=1, description="Largest archive that is accepted.")
     max_unpacked_mb: int = Field(16_384, ge=1, description="Largest capture that an archive may unpack to.")
@@ -39,6 +44,11 @@ class Settings(BaseModel):
     def database_url(self) -> str:
         """The database, the default filled in."""
         return self.database or default_database(self.data)
+
+    @property
+    def answers_to(self) -> frozenset[str]:
+        """`names`, one by one, in small letters."""
+        return frozenset(name.strip().lower() for name in self.names.split(","))
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ, **given: object) -> Settings:

@@ -207,7 +207,8 @@ def test_a_new_job_is_on_the_disk_before_anyone_hears_of_it(tmp_path: Path, monk
 
     monkeypatch.setattr(os, "fsync", fsync)
     job_id = store.create(spec(), capture)
-    assert len(written) == 2 and written <= files
+    assert len(written) == 2
+    assert written <= files
     assert (store.capture(DIGEST).joinpath("images").stat().st_ino, ["b.png"]) in synced
     assert ((tmp_path / "captures").stat().st_ino, [DIGEST]) in synced
     assert (store.folder(job_id).path.stat().st_ino, ["job.json"]) in synced

@@ -41,7 +41,9 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    return Settings(data=tmp_path / "data", max_upload_mb=1, max_unpacked_mb=2, max_files=100, min_free_mb=0)
+    return Settings(
+        data=tmp_path / "data", max_upload_mb=1, max_unpacked_mb=2, max_files=100, min_free_mb=0, names="testserver"
+    )
 
 
 @pytest.fixture

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from fastapi.testclient import TestClient
 
+from service.app import create_app
+from service.settings import Settings
 from tests.service.test_jobs import problem
 
 
@@ -22,3 +24,32 @@ def test_a_page_of_another_site_starts_and_deletes_nothing(
 @pytest.mark.parametrize("headers", [{}, {"Origin": "http://testserver"}, {"Origin": "HTTP://TestServer"}])
 def test_a_page_of_the_service_and_a_script_may(client: TestClient, archive: bytes, headers: dict[str, str]) -> None:
     assert client.post("/jobs", content=archive, headers=headers).status_code == 202
+
+
+@pytest.mark.parametrize(
+    "host", ["elsewhere.example", "elsewhere.example:8000", "127.0.0.1.elsewhere.example", "", "[1"]
+)
+def test_a_page_that_leads_its_own_name_here_learns_nothing(client: TestClient, job: str, host: str) -> None:
+    for method, path in (("GET", "/jobs"), ("GET", "/"), ("DELETE", f"/jobs/{job}")):
+        answer = client.request(method, path, headers={"Host": host, "Origin": f"http://{host}"})
+        assert "GRAINGS_NAMES" in problem(answer, 403)["detail"]
+    assert [one["id"] for one in client.get("/jobs").json()["jobs"]] == [job]
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:8000", "[::1]:8000", "192.168.1.7:80", "TestServer:8000"])
+def test_addresses_and_the_names_of_the_service_are_answered(client: TestClient, host: str) -> None:
+    assert client.get("/jobs", headers={"Host": host}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("names", "host", "status"),
+    [
+        ("localhost", "localhost:8000", 200),
+        ("localhost", "lab.example", 403),
+        ("localhost, Lab.example", "lab.example:8000", 200),
+        ("*", "elsewhere.example", 200),
+    ],
+)
+def test_an_operator_chooses_the_names(settings: Settings, names: str, host: str, status: int) -> None:
+    with TestClient(create_app(settings.model_copy(update={"names": names}))) as client:
+        assert client.get("/jobs", headers={"Host": host}).status_code == status
