@@ -6,8 +6,10 @@ nothing of images on disk, losses or HTTP.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import torch
 from jaxtyping import Float
@@ -17,6 +19,9 @@ from graings.camera import Camera
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from graings.scene.scene import Composition, Scene
+
+NO_COARSER: Final = 1.05  # than in training may the pixels that are drawn be
+MOST_PIXELS: Final = 1 << 24  # drawn for a picture that asks for fewer
 
 
 def render(
@@ -29,7 +34,50 @@ def render(
 ) -> RenderResult:
     """The scene at `time` in [0, 1] from `camera` on a `background` RGB in [0, 1], without gradients."""
     with torch.inference_mode():
-        return draw(scene.compose(camera.center, time), camera, background, settings=settings)
+        return picture(scene.compose(camera.center, time), camera, background, settings=settings)
+
+
+def picture(
+    composition: Composition,
+    camera: Camera,
+    background: Sequence[float],
+    *,
+    settings: RasterSettings | None = None,
+) -> RenderResult:
+    """As `draw`, without gradients, for any size: pixels coarser than those of training are means of finer ones.
+
+    A rasterizer looks at the middles of pixels only, and what the model knows lies between them: drawn at once, a
+    picture of half the size is 2 to 7 dB worse, and one of a quarter 8 to 17 (docs/experiments.md). The networks take
+    most of a picture's time, so that the finer pixels hardly cost any.
+    """
+    parts = parts_of_a_pixel(composition, camera)
+    with torch.no_grad():
+        if parts == 1:
+            return draw(composition, camera, background, settings=settings)
+        height, width = camera.height, camera.width
+        fine = draw(composition, camera.resized(parts * width, parts * height), background, settings=settings)
+        return replace(
+            fine,
+            color=_averaged(fine.color, parts),
+            alpha=_averaged(fine.alpha, parts),
+            means2d=fine.means2d / parts,
+            radii=fine.radii / parts,
+        )
+
+
+def parts_of_a_pixel(composition: Composition, camera: Camera) -> int:
+    """Into how many parts, along each side, a pixel of `camera` has to be divided to be as fine as in training."""
+    coarseness = math.sqrt(composition.sampling) / (math.sqrt(camera.fx) * math.sqrt(camera.fy))
+    bearable = math.isqrt(MOST_PIXELS // (camera.width * camera.height))
+    return max(1, math.ceil(min(coarseness / NO_COARSER, bearable)))
+
+
+def _averaged(fine: Float[Tensor, "fine_height fine_width *channel"], parts: int) -> Tensor:
+    """Means of `parts` x `parts` pixels; one axis after the other, which torch does several times faster."""
+    height, width = fine.shape[0] // parts, fine.shape[1] // parts
+    rows = fine.view(height, parts, -1).sum(1).view(height, width, parts, *fine.shape[2:])
+    total: Tensor = sum(rows.unbind(2), start=torch.zeros((), dtype=rows.dtype))
+    return total / parts**2
 
 
 def draw(
@@ -58,7 +106,7 @@ def draw(
 def low_pass(composition: Composition, camera: Camera) -> float:
     """Variance in px^2 that `camera` adds to both axes of a footprint, for a low-pass as wide as in training.
 
-    A picture of half the size with the pixels' own low-pass would show everything dilated: on trained scenes that costs
-    4 to 12 dB, and a picture of twice the size loses 1 to 8 (docs/experiments.md).
+    With the pixels' own a picture of twice the size shows the gaps that training had closed, and loses 1 to 8 dB
+    (docs/experiments.md).
     """
     return composition.blur * (camera.fx * camera.fy / composition.sampling)

@@ -22,7 +22,7 @@ from graings.camera import View
 from graings.machine import machine_facts, version_facts
 from graings.model import Model
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
-from graings.render import draw
+from graings.render import draw, picture
 from graings.scene.scene import Composition
 from graings.work_precision import pareto
 
@@ -135,7 +135,7 @@ class _Frame:
         camera = self.view.camera
         if way.scale != 1.0:
             camera = camera.resized(max(1, round(camera.width * way.scale)), max(1, round(camera.height * way.scale)))
-        return draw(self.composition, camera, model.background, settings=way.raster).color
+        return picture(self.composition, camera, model.background, settings=way.raster).color
 
 
 def _views(model: Model, count: int, seconds: float) -> tuple[str, tuple[View, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -11,7 +12,7 @@ from torch.nn.functional import avg_pool2d
 from graings.camera import sampling
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
-from graings.render import draw, low_pass, render
+from graings.render import MOST_PIXELS, draw, low_pass, parts_of_a_pixel, picture, render
 from graings.scene.scene import Scene
 from tests.capture.captures import orbit
 from tests.models import tiny_scene
@@ -38,7 +39,9 @@ def test_a_picture_has_the_low_pass_of_its_scene_in_its_own_pixels(
         asked = replace(settings or RasterSettings(), blur=low_pass(composition, camera))
         expected = rasterize(composition.gaussians, camera, torch.tensor(WHITE), settings=asked).color
         assert torch.equal(draw(composition, camera, WHITE, settings=settings).color, expected)
-        assert torch.equal(render(scene, camera, 0.5, WHITE, settings=settings).color, expected)
+        if share >= 1:  # smaller ones are drawn finer
+            assert torch.equal(picture(composition, camera, WHITE, settings=settings).color, expected)
+            assert torch.equal(render(scene, camera, 0.5, WHITE, settings=settings).color, expected)
         other = draw(replace(composition, blur=2.0), camera, WHITE, settings=settings).color
         assert not torch.equal(other, expected)
 
@@ -50,16 +53,45 @@ def test_a_camera_of_training_has_the_low_pass_to_the_bit() -> None:
 
 
 @pytest.mark.parametrize("parts", [2, 4])
-def test_a_small_picture_is_the_large_one_seen_from_farther(parts: int) -> None:
-    """Pixels of the small one are means of the large one's: nearer so than with as many px^2 as there."""
+def test_a_small_picture_is_the_mean_of_the_one_of_training(parts: int) -> None:
+    scene = trained_on(tiny_scene(anchors=40), (64, 64))
+    large = orbit(0, 3, (64, 64))
+    whole = render(scene, large, 0.5, WHITE)
+    found = render(scene, large.resized(64 // parts, 64 // parts), 0.5, WHITE)
+    mean = avg_pool2d(whole.color.permute(2, 0, 1), parts).permute(1, 2, 0)
+    torch.testing.assert_close(found.color, mean, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.alpha, avg_pool2d(whole.alpha[None], parts)[0], rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.means2d, whole.means2d / parts, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(found.radii, whole.radii / parts, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("size", "shape"), [(43, (43, 43)), (56, (56, 56)), (25, (25, 13)), (9, (9, 31))])
+def test_a_picture_of_any_smaller_size_is_what_fell_onto_its_pixels(size: int, shape: tuple[int, int]) -> None:
+    """Against a picture with sixteen times the pixels: at least four times nearer than one drawn at once."""
     scene = trained_on(tiny_scene(anchors=40), (64, 64))
     with torch.no_grad():
         scene.scaffold.log_scales -= 1.5  # about a pixel wide
-    large = orbit(0, 3, (64, 64))
-    small = large.resized(64 // parts, 64 // parts)
-    mean = avg_pool2d(render(scene, large, 0.5, WHITE).color.permute(2, 0, 1), parts).permute(1, 2, 0)
-    found = render(scene, small, 0.5, WHITE).color
+    small = orbit(0, 3, (64, 64)).resized(size, size).resized(*shape)
+    fine = small.resized(16 * shape[0], 16 * shape[1])
     composition = scene.compose(small.center, 0.5)
     with torch.no_grad():
-        dilated = draw(replace(composition, sampling=small.fx * small.fy), small, WHITE).color
-    assert 2 * float((found - mean).square().mean()) < float((dilated - mean).square().mean())
+        mean = avg_pool2d(draw(composition, fine, WHITE).color.permute(2, 0, 1), 16).permute(1, 2, 0)
+        at_once = draw(composition, small, WHITE).color
+    found = render(scene, small, 0.5, WHITE).color
+    assert found.shape == (shape[1], shape[0], 3)
+    assert 4 * float((found - mean).square().mean()) < float((at_once - mean).square().mean())
+
+
+def test_as_many_parts_as_training_had_pixels_and_no_more_than_memory_bears() -> None:
+    scene = trained_on(tiny_scene(anchors=4), (64, 64))
+    camera = orbit(0, 3, (64, 64))
+    composition = scene.compose(camera.center, 0.5)
+
+    def parts(share: float, width: int = 64, height: int = 64) -> int:
+        focal = camera.fx * share
+        return parts_of_a_pixel(composition, replace(camera, fx=focal, fy=focal, width=width, height=height))
+
+    assert [parts(share) for share in (4, 1, 0.96, 0.94, 0.5, 0.49, 0.26, 0.1)] == [1, 1, 1, 2, 2, 2, 4, 10]
+    assert parts(0.01, 4096, 4096) == 1
+    assert parts(0.01, 2048, 2048) == 2
+    assert parts(1e-200) == math.isqrt(MOST_PIXELS // 64**2)
