@@ -7,7 +7,6 @@ All lengths are in normalised units (`graings.units`). Knows nothing of images, 
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -139,6 +138,30 @@ class View:
     time: float
 
 
-def sampling(cameras: Sequence[Camera]) -> float:
-    """How finely `cameras` look, in the median: fx fy, the px^2 that a unit square at unit distance covers."""
-    return statistics.median(camera.fx * camera.fy for camera in cameras)
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """How finely cameras look at the content, which lies within `extent` of the origin.
+
+    `coarsest` and `finest` of them, in px per normalised unit at the origin: sqrt(fx fy) over the distance, and over
+    the extent for a camera nearer than that, which is amid the content.
+    """
+
+    extent: float
+    coarsest: float
+    finest: float
+
+    @staticmethod
+    def of(cameras: Sequence[Camera], extent: float) -> Sampling:
+        """That of at least one camera."""
+        every = [_sampling(camera, extent) for camera in cameras]
+        return Sampling(extent, min(every), max(every))
+
+    def coarseness(self, camera: Camera) -> float:
+        """How many times coarser `camera` looks than the coarsest; below 1 if finer than the finest, 1 in between."""
+        own = _sampling(camera, self.extent)
+        return min(max(own, self.coarsest), self.finest) / own
+
+
+def _sampling(camera: Camera, extent: float) -> float:
+    distance = max(float(np.linalg.norm(camera.center)), extent)
+    return math.sqrt(camera.fx) * math.sqrt(camera.fy) / distance

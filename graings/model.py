@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from graings.camera import Camera, View, sampling
+from graings.camera import Camera, Sampling, View
 from graings.config import TrainConfig, restored_shape, restored_training
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
@@ -72,11 +72,12 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
     shape = restored_shape(facts["scene_config"], path)
     rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
     views = {split: tuple(map(_view_from_json, members)) for split, members in facts["views"].items()}
+    extent = float(tensors["extent"])
     scene = Scene(
         shape,
         Scaffold(**rows),
-        extent=float(tensors["extent"]),
-        sampling=sampling([view.camera for view in views["train"]]),
+        extent=extent,
+        sampling=Sampling.of([view.camera for view in views["train"]], extent),
         initial_opacity=0.1,
     )
     scene.load_state_dict(tensors)

@@ -44,7 +44,7 @@ def picture(
     *,
     settings: RasterSettings | None = None,
 ) -> RenderResult:
-    """As `draw`, without gradients, for any size: pixels coarser than those of training are means of finer ones.
+    """As `draw`, without gradients, for any size and distance: pixels coarser than training's are means of finer ones.
 
     A rasterizer looks at the middles of pixels only, and what the model knows lies between them: drawn at once, a
     picture of half the size is 2 to 7 dB worse, and one of a quarter 8 to 17 (docs/experiments.md). The networks take
@@ -67,7 +67,7 @@ def picture(
 
 def parts_of_a_pixel(composition: Composition, camera: Camera) -> int:
     """Into how many parts, along each side, a pixel of `camera` has to be divided to be as fine as in training."""
-    coarseness = math.sqrt(composition.sampling) / (math.sqrt(camera.fx) * math.sqrt(camera.fy))
+    coarseness = composition.sampling.coarseness(camera)
     bearable = math.isqrt(MOST_PIXELS // (camera.width * camera.height))
     return max(1, math.ceil(min(coarseness / NO_COARSER, bearable)))
 
@@ -104,9 +104,10 @@ def draw(
 
 
 def low_pass(composition: Composition, camera: Camera) -> float:
-    """Variance in px^2 that `camera` adds to both axes of a footprint, for a low-pass as wide as in training.
+    """Variance in px^2 that `camera` adds to both axes of a footprint: in training, and for what looks as finely, that
+    of the composition; else one as wide on the scene as the nearest camera of training had it.
 
     With the pixels' own a picture of twice the size shows the gaps that training had closed, and loses 1 to 8 dB
     (docs/experiments.md).
     """
-    return composition.blur * (camera.fx * camera.fy / composition.sampling)
+    return composition.blur / composition.sampling.coarseness(camera) ** 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from graings.camera import Sampling
 from graings.config import SceneConfig
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
@@ -11,7 +12,7 @@ from graings.scene.scene import Scene
 EYE = (0.0, -2.0, 0.5)
 
 
-SAMPLING = 30.0**2  # fx fy of small test cameras, about
+SAMPLING = Sampling(extent=1.0, coarsest=10.0, finest=10.0)  # of small test cameras, about
 
 
 def tiny_scene(

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from graings.camera import sampling
+from graings.camera import Camera, Sampling
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
 from graings.render import MOST_PIXELS, draw, low_pass, parts_of_a_pixel, picture, render
@@ -22,7 +22,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 def trained_on(scene: Scene, size: tuple[int, int]) -> Scene:
     """`scene` as if its training views had this size."""
-    scene.sampling = sampling([orbit(i, 3, size) for i in range(3)])
+    scene.sampling = Sampling.of([orbit(i, 3, size) for i in range(3)], float(scene.extent))
     return scene
 
 
@@ -52,6 +52,24 @@ def test_a_camera_of_training_has_the_low_pass_to_the_bit() -> None:
     assert low_pass(scene.compose(camera.center, 0.5), camera) == scene.config.blur
 
 
+def test_all_cameras_of_training_draw_alike_and_beyond_them_the_nearest_counts() -> None:
+    """So that what training saw is served as it was seen, whatever the distances; a camera amid the content is none."""
+    scene = tiny_scene(anchors=4)
+    near, middle, far = (orbit(i, 3, (32, 32), distance) for i, distance in enumerate((2.0, 3.0, 5.0)))
+    scene.sampling = Sampling.of([far, near], float(scene.extent))
+    composition = scene.compose(near.center, 0.5)
+
+    def drawn(camera: Camera) -> tuple[float, int]:
+        return low_pass(composition, camera) / scene.config.blur, parts_of_a_pixel(composition, camera)
+
+    assert [drawn(camera) for camera in (near, middle, far)] == [(1.0, 1)] * 3
+    assert drawn(orbit(0, 3, (32, 32), 10.0)) == (pytest.approx(1 / 4), 2)
+    assert drawn(orbit(0, 3, (16, 16), 15.0)) == (pytest.approx(1 / 36), 6)
+    assert drawn(orbit(0, 3, (32, 32), 1.0)) == (pytest.approx(4), 1)
+    assert drawn(orbit(0, 3, (32, 32), 1e-3)) == (pytest.approx(4), 1)  # as at the extent, which is 1
+    assert drawn(orbit(0, 3, (64, 64), 2.0)) == (pytest.approx(4), 1)
+
+
 @pytest.mark.parametrize("parts", [2, 4])
 def test_a_small_picture_is_the_mean_of_the_one_of_training(parts: int) -> None:
     scene = trained_on(tiny_scene(anchors=40), (64, 64))
@@ -65,13 +83,18 @@ def test_a_small_picture_is_the_mean_of_the_one_of_training(parts: int) -> None:
     torch.testing.assert_close(found.radii, whole.radii / parts, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize(("size", "shape"), [(43, (43, 43)), (56, (56, 56)), (25, (25, 13)), (9, (9, 31))])
-def test_a_picture_of_any_smaller_size_is_what_fell_onto_its_pixels(size: int, shape: tuple[int, int]) -> None:
-    """Against a picture with sixteen times the pixels: at least four times nearer than one drawn at once."""
+@pytest.mark.parametrize(
+    ("size", "shape", "distance"),
+    [(43, (43, 43), 4), (56, (56, 56), 4), (25, (25, 13), 4), (9, (9, 31), 4), (64, (64, 64), 8), (43, (43, 43), 13)],
+)
+def test_a_picture_that_looks_coarser_is_what_fell_onto_its_pixels(
+    size: int, shape: tuple[int, int], distance: float
+) -> None:
+    """Smaller or from farther, against one with sixteen times the pixels: four times nearer than if drawn at once."""
     scene = trained_on(tiny_scene(anchors=40), (64, 64))
     with torch.no_grad():
         scene.scaffold.log_scales -= 1.5  # about a pixel wide
-    small = orbit(0, 3, (64, 64)).resized(size, size).resized(*shape)
+    small = orbit(0, 3, (64, 64), distance).resized(size, size).resized(*shape)
     fine = small.resized(16 * shape[0], 16 * shape[1])
     composition = scene.compose(small.center, 0.5)
     with torch.no_grad():

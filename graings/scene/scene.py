@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from graings import constants
+from graings.camera import Sampling
 from graings.config import SceneConfig
 from graings.gaussians import Gaussians
 from graings.scene.appearance import CanonicalAppearance, ResidualField
@@ -44,15 +45,15 @@ class Composition:
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
     opacities: Float[Tensor, "anchor child"]  # score of every slot, o(t) where it may be drawn at all; no gradient
     blur: float  # low-pass that the Gaussians were trained to be seen with, px^2 of views with this `sampling`
-    sampling: float  # fx fy of those views, px^2
+    sampling: Sampling
 
 
 class Scene(nn.Module):
     """The model. `temporal` off (static warm-up, or a single instant) leaves the time modules unevaluated.
 
     `extent` is the half-size of the content in normalised units; positions enter the networks divided by it. `sampling`
-    is fx fy of the views it is trained on, px^2: the low-pass is a part of what was learned, as large on the scene for
-    any other picture. `seed` is that of the networks' first weights.
+    is that of the views it is trained on: the low-pass is a part of what was learned, as large on the scene for any
+    other picture. `seed` is that of the networks' first weights.
     """
 
     extent: Tensor
@@ -63,7 +64,7 @@ class Scene(nn.Module):
         scaffold: Scaffold,
         *,
         extent: float,
-        sampling: float,
+        sampling: Sampling,
         initial_opacity: float,
         seed: int = 0,
     ) -> None:

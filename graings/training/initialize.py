@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from graings.camera import sampling
+from graings.camera import Sampling
 from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
@@ -74,7 +74,7 @@ def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, stream
         scene,
         scaffold,
         extent=extent,
-        sampling=sampling([frame.camera for frame in capture.train]),
+        sampling=Sampling.of([frame.camera for frame in capture.train], extent),
         initial_opacity=config.init.opacity,
         seed=config.seed,
     )
