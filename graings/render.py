@@ -21,7 +21,7 @@ from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from graings.scene.scene import Composition, Scene
 
 NO_COARSER: Final = 1.05  # than in training may the pixels that are drawn be
-MOST_PIXELS: Final = 1 << 24  # drawn for a picture that asks for fewer
+MOST_PIXELS: Final = 1 << 23  # drawn for a picture that asks for fewer: four for each of 1920 x 1080, in 200 MB
 
 
 def render(

@@ -116,5 +116,5 @@ def test_as_many_parts_as_training_had_pixels_and_no_more_than_memory_bears() ->
 
     assert [parts(share) for share in (4, 1, 0.96, 0.94, 0.5, 0.49, 0.26, 0.1)] == [1, 1, 1, 2, 2, 2, 4, 10]
     assert parts(0.01, 4096, 4096) == 1
-    assert parts(0.01, 2048, 2048) == 2
+    assert parts(0.01, 1920, 1080) == 2
     assert parts(1e-200) == math.isqrt(MOST_PIXELS // 64**2)
