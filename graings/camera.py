@@ -156,10 +156,10 @@ class Sampling:
         every = [_sampling(camera, extent) for camera in cameras]
         return Sampling(extent, min(every), max(every))
 
-    def coarseness(self, camera: Camera) -> float:
-        """How many times coarser `camera` looks than the coarsest; below 1 if finer than the finest, 1 in between."""
+    def fineness(self, camera: Camera) -> float:
+        """How many times finer `camera` looks than the finest; below 1 if coarser than the coarsest, 1 in between."""
         own = _sampling(camera, self.extent)
-        return min(max(own, self.coarsest), self.finest) / own
+        return own / min(max(own, self.coarsest), self.finest)
 
 
 def _sampling(camera: Camera, extent: float) -> float:

@@ -67,9 +67,9 @@ def picture(
 
 def parts_of_a_pixel(composition: Composition, camera: Camera) -> int:
     """Into how many parts, along each side, a pixel of `camera` has to be divided to be as fine as in training."""
-    coarseness = composition.sampling.coarseness(camera)
-    bearable = math.isqrt(MOST_PIXELS // (camera.width * camera.height))
-    return max(1, math.ceil(min(coarseness / NO_COARSER, bearable)))
+    bearable = max(1, math.isqrt(MOST_PIXELS // (camera.width * camera.height)))
+    share = max(NO_COARSER * composition.sampling.fineness(camera), 1 / bearable)  # of a pixel of training
+    return min(math.ceil(1 / share), bearable)
 
 
 def _averaged(fine: Float[Tensor, "fine_height fine_width *channel"], parts: int) -> Tensor:
@@ -110,4 +110,5 @@ def low_pass(composition: Composition, camera: Camera) -> float:
     With the pixels' own a picture of twice the size shows the gaps that training had closed, and loses 1 to 8 dB
     (docs/experiments.md).
     """
-    return composition.blur / composition.sampling.coarseness(camera) ** 2
+    fineness = composition.sampling.fineness(camera)
+    return composition.blur * fineness * fineness  # a power would raise where this is infinite

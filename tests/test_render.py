@@ -118,3 +118,10 @@ def test_as_many_parts_as_training_had_pixels_and_no_more_than_memory_bears() ->
     assert parts(0.01, 4096, 4096) == 1
     assert parts(0.01, 1920, 1080) == 2
     assert parts(1e-200) == math.isqrt(MOST_PIXELS // 64**2)
+
+
+@pytest.mark.parametrize("focal", [1e-300, 1e-200, 1e200, 1e300])
+def test_no_field_of_view_is_too_wide_or_too_narrow(focal: float) -> None:
+    scene = trained_on(tiny_scene(anchors=4), (64, 64))
+    camera = replace(orbit(0, 3, (16, 16)), fx=focal, fy=focal)
+    assert bool(render(scene, camera, 0.5, WHITE).color.isfinite().all())
