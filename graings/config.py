@@ -106,8 +106,8 @@ class SceneConfig(Part):
         0.1,
         ge=0,
         le=10,
-        description="Low-pass of the picture: variance added to every footprint, in px^2 of the training views, and as "
-        "large on the scene in pictures of other sizes. A pixel's own box has 1/12, 3DGS 0.3.",
+        description="Low-pass of the picture: variance added to every footprint, in px^2 of the finer training "
+        "views, and as large on the scene in all others and in other pictures. A pixel's own box has 1/12, 3DGS 0.3.",
     )
     opacity_view: bool = Field(False, description="Feed the viewing direction to the opacity head, as the paper does.")
     projected_clip: bool = Field(True, description="Let clipped values receive gradients that point back inside.")

@@ -20,7 +20,6 @@ from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from graings.scene.scene import Composition, Scene
 
-NO_COARSER: Final = 1.05  # than in training may the pixels that are drawn be
 MOST_PIXELS: Final = 1 << 23  # drawn for a picture that asks for fewer: four for each of 1920 x 1080, in 200 MB
 
 
@@ -68,7 +67,7 @@ def picture(
 def parts_of_a_pixel(composition: Composition, camera: Camera) -> int:
     """Into how many parts, along each side, a pixel of `camera` has to be divided to be as fine as in training."""
     bearable = max(1, math.isqrt(MOST_PIXELS // (camera.width * camera.height)))
-    share = max(NO_COARSER * composition.sampling.fineness(camera), 1 / bearable)  # of a pixel of training
+    share = max(composition.sampling.fineness(camera), 1 / bearable)  # of a pixel of training
     return min(math.ceil(1 / share), bearable)
 
 
@@ -104,11 +103,11 @@ def draw(
 
 
 def low_pass(composition: Composition, camera: Camera) -> float:
-    """Variance in px^2 that `camera` adds to both axes of a footprint: in training, and for what looks as finely, that
-    of the composition; else one as wide on the scene as the nearest camera of training had it.
+    """Variance in px^2 that `camera` adds to both axes of a footprint: as wide on the scene in every picture.
 
-    With the pixels' own a picture of twice the size shows the gaps that training had closed, and loses 1 to 8 dB
-    (docs/experiments.md).
+    The composition's own where the camera looks as finely as training's reference. With as much in the pixels of every
+    camera, a picture of twice the size shows the gaps that training had closed, and far views of training widen what
+    near ones want narrow: 1 to 8 dB (docs/experiments.md).
     """
     fineness = composition.sampling.fineness(camera)
     return composition.blur * fineness * fineness  # a power would raise where this is infinite

@@ -34,7 +34,8 @@ def test_a_picture_has_the_low_pass_of_its_scene_in_its_own_pixels(
     scene = trained_on(tiny_scene(anchors=40), (32, 32))
     camera = orbit(0, 3, (32, 32)).resized(int(32 * share), int(32 * share))
     composition = scene.compose(camera.center, 0.5)
-    assert low_pass(composition, camera) == pytest.approx(scene.config.blur * share**2, rel=1e-12)
+    beyond = {0.5: 0.5 * 1.05, 1.0: 1.0, 3.0: 3.0 / 1.05}[share]
+    assert low_pass(composition, camera) == pytest.approx(scene.config.blur * beyond**2, rel=1e-12)
     with torch.no_grad():
         asked = replace(settings or RasterSettings(), blur=low_pass(composition, camera))
         expected = rasterize(composition.gaussians, camera, torch.tensor(WHITE), settings=asked).color
@@ -52,22 +53,37 @@ def test_a_camera_of_training_has_the_low_pass_to_the_bit() -> None:
     assert low_pass(scene.compose(camera.center, 0.5), camera) == scene.config.blur
 
 
-def test_all_cameras_of_training_draw_alike_and_beyond_them_the_nearest_counts() -> None:
-    """So that what training saw is served as it was seen, whatever the distances; a camera amid the content is none."""
+def test_the_low_pass_is_as_wide_on_the_scene_from_everywhere() -> None:
+    """Training views of other distances count as any other picture; a camera amid the content is at its rim."""
     scene = tiny_scene(anchors=4)
-    near, middle, far = (orbit(i, 3, (32, 32), distance) for i, distance in enumerate((2.0, 3.0, 5.0)))
-    scene.sampling = Sampling.of([far, near], float(scene.extent))
+    near, far = (orbit(i, 3, (32, 32), distance) for i, distance in enumerate((2.0, 5.0)))
+    scene.sampling = Sampling.of([near, far, near], float(scene.extent))
     composition = scene.compose(near.center, 0.5)
 
     def drawn(camera: Camera) -> tuple[float, int]:
         return low_pass(composition, camera) / scene.config.blur, parts_of_a_pixel(composition, camera)
 
-    assert [drawn(camera) for camera in (near, middle, far)] == [(1.0, 1)] * 3
-    assert drawn(orbit(0, 3, (32, 32), 10.0)) == (pytest.approx(1 / 4), 2)
-    assert drawn(orbit(0, 3, (16, 16), 15.0)) == (pytest.approx(1 / 36), 6)
-    assert drawn(orbit(0, 3, (32, 32), 1.0)) == (pytest.approx(4), 1)
-    assert drawn(orbit(0, 3, (32, 32), 1e-3)) == (pytest.approx(4), 1)  # as at the extent, which is 1
-    assert drawn(orbit(0, 3, (64, 64), 2.0)) == (pytest.approx(4), 1)
+    assert drawn(near) == (1.0, 1)
+    assert drawn(far) == (pytest.approx((1.05 * 2 / 5) ** 2), 3)
+    assert drawn(orbit(0, 3, (32, 32), 10.0)) == (pytest.approx((1.05 / 5) ** 2), 5)
+    assert drawn(orbit(0, 3, (16, 16), 15.0)) == (pytest.approx((1.05 / 15) ** 2), 15)
+    assert drawn(orbit(0, 3, (32, 32), 1.0)) == (pytest.approx((2 / 1.05) ** 2), 1)
+    assert drawn(orbit(0, 3, (32, 32), 1e-3)) == (pytest.approx((2 / 1.05) ** 2), 1)  # as at the extent, which is 1
+    assert drawn(orbit(0, 3, (64, 64), 2.0)) == (pytest.approx((2 / 1.05) ** 2), 1)
+
+
+def test_a_single_close_up_does_not_make_all_other_pictures_dear() -> None:
+    far = [orbit(i, 3, (32, 32), 4.0) for i in range(19)]
+    assert Sampling.of([*far, orbit(0, 3, (32, 32), 1.0)], 1.0) == Sampling.of(far, 1.0)
+
+
+@pytest.mark.parametrize("share", [1 / 1.04, 1.0, 1.04])
+def test_what_looks_about_as_finely_is_drawn_as_in_training(share: float) -> None:
+    scene = trained_on(tiny_scene(anchors=4), (32, 32))
+    camera = orbit(1, 3, (32, 32))
+    other = replace(camera, fx=share * camera.fx, fy=share * camera.fy)
+    composition = scene.compose(camera.center, 0.5)
+    assert (low_pass(composition, other), parts_of_a_pixel(composition, other)) == (scene.config.blur, 1)
 
 
 @pytest.mark.parametrize("parts", [2, 4])

@@ -44,7 +44,7 @@ class Composition:
     deformation: Deformation | None
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
     opacities: Float[Tensor, "anchor child"]  # score of every slot, o(t) where it may be drawn at all; no gradient
-    blur: float  # low-pass that the Gaussians were trained to be seen with, px^2 of views with this `sampling`
+    blur: float  # low-pass that the Gaussians were trained to be seen with, px^2 where a view is as fine as `sampling`
     sampling: Sampling
 
 
@@ -52,8 +52,8 @@ class Scene(nn.Module):
     """The model. `temporal` off (static warm-up, or a single instant) leaves the time modules unevaluated.
 
     `extent` is the half-size of the content in normalised units; positions enter the networks divided by it. `sampling`
-    is that of the views it is trained on: the low-pass is a part of what was learned, as large on the scene for any
-    other picture. `seed` is that of the networks' first weights.
+    is that of the views it is trained on: the low-pass is a part of what was learned, as large on the scene in every
+    picture, of training too. `seed` is that of the networks' first weights.
     """
 
     extent: Tensor
