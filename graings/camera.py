@@ -17,6 +17,7 @@ Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 MOST = 0.9  # of the cameras of training; half of them serves near views 0.5 dB worse (docs/experiments.md)
 ALIKE = 1.05  # so many times finer or coarser makes no difference
+AT_ONCE = 1.5  # times coarser than the reference: down to there what training drew is served alike
 _EXACT = 1e-12  # an orthonormal matrix in float64 is no worse, so that one that was made exact stays as it is
 
 
@@ -145,22 +146,30 @@ class Sampling:
     """How finely the cameras of training look at the content, which lies within `extent` of the origin.
 
     `reference`, in px per normalised unit at the origin, is what nine of ten of them do not exceed: the details of the
-    near ones count, and a single close-up does not. A camera's own is sqrt(fx fy) over its distance, or over the extent
-    where it is nearer than that and so amid the content.
+    near ones count, and a single close-up does not. `coarsest` is what is still drawn at once, as training draws all:
+    the coarsest of them, but not much below the reference. A camera's own is sqrt(fx fy) over its distance, or over the
+    extent where it is nearer than that and so amid the content.
     """
 
     extent: float
     reference: float
+    coarsest: float
 
     @staticmethod
     def of(cameras: Sequence[Camera], extent: float) -> Sampling:
         """That of at least one camera."""
-        return Sampling(extent, float(np.quantile([_sampling(camera, extent) for camera in cameras], MOST)))
+        every = [_sampling(camera, extent) for camera in cameras]
+        reference = float(np.quantile(every, MOST))
+        return Sampling(extent, reference, min(reference, max(min(every), reference / AT_ONCE)))
 
     def fineness(self, camera: Camera) -> float:
         """How many times finer than the reference `camera` looks; below 1 if coarser, 1 if about alike."""
         own = _sampling(camera, self.extent)
         return own / min(max(own, self.reference / ALIKE), self.reference * ALIKE)
+
+    def coarseness(self, camera: Camera) -> float:
+        """How many times coarser `camera` looks than what is drawn at once; 1 and less if it is not coarser."""
+        return self.coarsest / ALIKE / _sampling(camera, self.extent)
 
 
 def _sampling(camera: Camera, extent: float) -> float:

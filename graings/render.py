@@ -67,8 +67,7 @@ def picture(
 def parts_of_a_pixel(composition: Composition, camera: Camera) -> int:
     """Into how many parts, along each side, a pixel of `camera` has to be divided to be as fine as in training."""
     bearable = max(1, math.isqrt(MOST_PIXELS // (camera.width * camera.height)))
-    share = max(composition.sampling.fineness(camera), 1 / bearable)  # of a pixel of training
-    return min(math.ceil(1 / share), bearable)
+    return max(1, math.ceil(min(composition.sampling.coarseness(camera), bearable)))
 
 
 def _averaged(fine: Float[Tensor, "fine_height fine_width *channel"], parts: int) -> Tensor:

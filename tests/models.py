@@ -12,7 +12,7 @@ from graings.scene.scene import Scene
 EYE = (0.0, -2.0, 0.5)
 
 
-SAMPLING = Sampling(extent=1.0, reference=10.0)  # of small test cameras, about
+SAMPLING = Sampling(extent=1.0, reference=10.0, coarsest=10.0)  # of small test cameras, about
 
 
 def tiny_scene(

@@ -64,12 +64,24 @@ def test_the_low_pass_is_as_wide_on_the_scene_from_everywhere() -> None:
         return low_pass(composition, camera) / scene.config.blur, parts_of_a_pixel(composition, camera)
 
     assert drawn(near) == (1.0, 1)
-    assert drawn(far) == (pytest.approx((1.05 * 2 / 5) ** 2), 3)
-    assert drawn(orbit(0, 3, (32, 32), 10.0)) == (pytest.approx((1.05 / 5) ** 2), 5)
-    assert drawn(orbit(0, 3, (16, 16), 15.0)) == (pytest.approx((1.05 / 15) ** 2), 15)
+    assert drawn(far) == (pytest.approx((1.05 * 2 / 5) ** 2), 2)
+    assert drawn(orbit(0, 3, (32, 32), 3.1)) == (pytest.approx((1.05 * 2 / 3.1) ** 2), 1)  # within 1.5 x 1.05
+    assert drawn(orbit(0, 3, (32, 32), 3.2)) == (pytest.approx((1.05 * 2 / 3.2) ** 2), 2)
+    assert drawn(orbit(0, 3, (32, 32), 10.0)) == (pytest.approx((1.05 / 5) ** 2), 4)
+    assert drawn(orbit(0, 3, (16, 16), 15.0)) == (pytest.approx((1.05 / 15) ** 2), 10)
     assert drawn(orbit(0, 3, (32, 32), 1.0)) == (pytest.approx((2 / 1.05) ** 2), 1)
     assert drawn(orbit(0, 3, (32, 32), 1e-3)) == (pytest.approx((2 / 1.05) ** 2), 1)  # as at the extent, which is 1
     assert drawn(orbit(0, 3, (64, 64), 2.0)) == (pytest.approx((2 / 1.05) ** 2), 1)
+
+
+def test_what_training_drew_a_little_coarser_is_served_alike() -> None:
+    """And what no view of training was as coarse as is not."""
+    scene = tiny_scene(anchors=4)
+    near, far = (orbit(i, 3, (32, 32), distance) for i, distance in enumerate((2.0, 2.5)))
+    scene.sampling = Sampling.of([near, far, near], float(scene.extent))
+    composition = scene.compose(near.center, 0.5)
+    distances = (2.0, 2.5, 2.6, 2.7)
+    assert [parts_of_a_pixel(composition, orbit(0, 3, (32, 32), d)) for d in distances] == [1, 1, 1, 2]
 
 
 def test_a_single_close_up_does_not_make_all_other_pictures_dear() -> None:
