@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
-MOST = 0.9  # of the cameras of training; half of them serves near views 0.5 dB worse (docs/experiments.md)
+MOST = 0.9  # of the cameras of training do not look finer than the reference
 ALIKE = 1.05  # so many times finer or coarser makes no difference
 AT_ONCE = 1.5  # times coarser than the reference: down to there what training drew is served alike
 _EXACT = 1e-12  # an orthonormal matrix in float64 is no worse, so that one that was made exact stays as it is
