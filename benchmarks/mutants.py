@@ -40,7 +40,7 @@ COPIED = ("graings", "tests", "CMakeLists.txt", "pyproject.toml")
 SOURCE = "graings/kernel/csrc"
 RASTER = ("tests/raster",)
 FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)
-IN_A_TEST = re.compile(r'File ".*/(tests/\S+\.py)", line \d+ in (test_\w+)')  # of a stack that faulthandler prints
+IN_A_TEST = re.compile(r"^(tests/\S+::.*\S) \Z", re.MULTILINE)  # begun, and no word of how it ended
 
 # An installed package may be found by an import finder of its own, before the working folder: without it.
 RUN_PYTEST = """
@@ -428,11 +428,11 @@ class Copy:
 
         Raises `SystemExit` where they could not be run at all.
         """
-        command = [sys.executable, "-c", RUN_PYTEST, str(self.folder), "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+        command = [sys.executable, "-c", RUN_PYTEST, str(self.folder), "-v", "-m", "not slow", "-p", "no:cacheprovider"]
         ran = subprocess.run([*command, *options, *tests], cwd=self.folder, capture_output=True, text=True, check=False)
         failed = FAILED.findall(ran.stdout)
-        if ran.returncode < 0 and (ended := IN_A_TEST.search(ran.stderr)):
-            return [f"{ended[1]}::{ended[2]}"]
+        if ran.returncode < 0 and (ended := IN_A_TEST.search(ran.stdout)):
+            return [ended[1]]
         if ran.returncode not in (0, 1) or (ran.returncode == 1) != bool(failed):
             raise SystemExit(f"pytest could not run:\n{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}")
         return failed

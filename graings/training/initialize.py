@@ -125,7 +125,7 @@ def _carved(
 
     whole = seen(1.0)
     refuse_empty(whole)  # in a part of the clip all may be out of sight
-    widest = None
+    best, most = None, -1.0
     for share in SHARES if config.time_window is None else [config.time_window]:
         views = whole if share == 1 else seen(share)
         if config.time_window is None and share < 1 and len(views) < MIN_VIEWS:
@@ -133,10 +133,12 @@ def _carved(
         kept = carve(cube, views, config.init.carve_vote)
         if len(kept) < MIN_CARVED:
             continue
-        if coverage(kept, views, cells) >= LEAST_COVERED:
-            return kept, share
-        widest = widest or (kept, share)
-    return widest
+        covered = coverage(kept, views, cells)
+        if covered > most:
+            best, most = (kept, share), covered
+        if covered >= LEAST_COVERED:
+            break
+    return best
 
 
 def content_half_size(capture: Capture) -> float:

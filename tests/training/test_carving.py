@@ -13,9 +13,9 @@ import pytest
 from graings.capture.image_file import decode
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
-from graings.capture.synthetic import Body, SyntheticScene, write_synthetic
+from graings.capture.synthetic import Array, Body, SyntheticScene, write_synthetic
 from graings.config import TrainConfig, make_config
-from graings.training.carving import carve, coverage, masked
+from graings.training.carving import LEAST_COVERED, carve, coverage, masked
 from graings.training.initialize import first_points
 from graings.training.streams import Streams
 from tests.capture.captures import write_image
@@ -27,16 +27,30 @@ WHITE = (1.0, 1.0, 1.0)
 @pytest.fixture
 def flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A small ball that flies to and fro, three times its own width, and turns around at the middle of the clip."""
-    ball = Body(
-        home=np.zeros(3),
-        swing=np.array([0.8, 0.3, 0.0]),
-        semi_axes=np.full(3, 0.24),
+    ball = _ball(np.zeros(3), np.array([0.8, 0.3, 0.0]), 0.24)
+    monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((ball,))))
+    return write_synthetic(tmp_path / "flight", frames=48, size=40)
+
+
+@pytest.fixture
+def accompanied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A large ball that stays in the middle, and well above it a small one that flies to and fro."""
+    still = _ball(np.zeros(3), np.zeros(3), 0.5)
+    small = _ball(np.array([0.0, 0.0, 0.9]), np.array([0.8, 0.3, 0.0]), 0.2)
+    monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((still, small))))
+    return write_synthetic(tmp_path / "accompanied", frames=48, size=40)
+
+
+def _ball(home: Array, swing: Array, radius: float) -> Body:
+    """A red ball that is farthest along its swing at the ends of the clip, and farthest back at its middle."""
+    return Body(
+        home=home,
+        swing=swing,
+        semi_axes=np.full(3, radius),
         axis=np.array([0.0, 0.0, 1.0]),
         colors=np.array([[0.8, 0.1, 0.1], [0.3, 0.1, 0.1]]),
         phases=np.full(6, math.pi / 2),
     )
-    monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((ball,))))
-    return write_synthetic(tmp_path / "flight", frames=48, size=40)
 
 
 def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
@@ -115,9 +129,34 @@ def test_a_picture_without_alpha_shows_something_everywhere(tmp_path: Path) -> N
 def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
     data = load_capture(flight)
     views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
-    grid = np.stack(np.meshgrid(*[np.linspace(-1.4, 1.4, 40)] * 3), axis=-1).reshape(-1, 3)
-    kept = carve(grid, views, 0.6)
-    assert 0 < len(kept) < 0.05 * len(grid)
-    assert coverage(kept, views, 50) > 0.9
+    kept = carve(_grid(), views, 0.6)
+    assert 0 < len(kept) < 0.05 * len(_grid())
+    assert coverage(kept, views, 50) > LEAST_COVERED
     assert coverage(kept + 5, views, 50) == 0
     assert coverage(kept[:1], views, 50) < coverage(kept, views, 50)
+
+
+def test_a_small_thing_without_points_is_not_covered_by_a_large_one(accompanied: Path) -> None:
+    data = load_capture(accompanied)
+    places = data.units.points_back(_grid())
+    large = np.linalg.norm(places, axis=-1) < 0.5
+    small = np.linalg.norm(places - (0.8, 0.3, 0.9), axis=-1) < 0.2  # where it is at the ends of the clip
+    ends = masked([data.train[0], data.train[-1]] * 20, ImageStore(WHITE), WHITE)
+    middle = masked(data.train[24:25], ImageStore(WHITE), WHITE)
+    assert coverage(_grid()[large | small], ends, 50) > 0.9
+    assert coverage(_grid()[large], ends, 50) == 0
+    assert coverage(_grid()[large | small], middle, 50) == 0
+    assert coverage(_grid()[large | small], ends + middle, 50) > 0.9  # one of many views may be wrong
+    assert coverage(_grid()[large | small], ends[:4] + middle, 50) < LEAST_COVERED
+
+
+def test_a_small_thing_that_flies_is_reason_enough_to_begin_with_a_part_of_the_clip(accompanied: Path) -> None:
+    for seed in range(3):
+        data = load_capture(accompanied)
+        _, window = first_points(data, ImageStore(WHITE), make_config("draft"), Streams(seed))
+        assert window < 1
+
+
+def _grid() -> Array:
+    """Places [64000, 3] all over what the cameras see."""
+    return np.stack(np.meshgrid(*[np.linspace(-0.36, 0.36, 40)] * 3), axis=-1).reshape(-1, 3)
