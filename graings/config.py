@@ -120,7 +120,7 @@ class InitConfig(Part):
     carve_vote: float = Field(0.6, ge=0, le=1, description="Share of views whose mask a random point must hit to stay.")
     max_points: int = Field(60_000, ge=16, description="At most this many points of a given cloud are used.")
     voxel_size: float | None = Field(
-        None, ge=1e-9, description="Finest anchor cell, normalised; null: 0.7 pixel footprints."
+        None, ge=1e-9, description="Finest anchor cell, normalised; null: 0.7 px of the finer training views."
     )
     offset_std: float = Field(0.3, ge=0, le=10, description="Spread of the first child offsets in units of s_a.")
     opacity: float = Field(0.1, gt=0.004, lt=0.99, description="Opacity score that all children start with.")

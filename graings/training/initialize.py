@@ -36,7 +36,8 @@ from graings.training.time_window import TimeWindow
 
 FEATURE_STD = 0.1
 
-# The finest cell in pixel footprints at the scene's centre: 0.005 units on D-NeRF at 400 px, 0.0025 at 800.
+# The finest cell in pixels at the scene's centre, of views as fine as the reference: on D-NeRF 0.005 of its units at
+# 400 px, 0.0025 at 800.
 VOXEL_PER_PIXEL = 0.7
 
 # Voting needs enough views to outvote a few wrong masks, not all of them.
@@ -56,11 +57,12 @@ class Start:
 
 def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams) -> Start:
     """A scene of the first anchors. Raises `CaptureError` where no image shows anything."""
-    voxel = config.init.voxel_size or VOXEL_PER_PIXEL * pixel_footprint(capture)
     points, window = first_points(capture, images, config, streams)
+    extent = float(torch.quantile(torch.from_numpy(points).norm(dim=-1).float(), 0.99)) or 1.0
+    sampling = Sampling.of([frame.camera for frame in capture.train], extent)
+    voxel = config.init.voxel_size or VOXEL_PER_PIXEL / sampling.reference
     cells = torch.unique(voxel_keys(torch.from_numpy(points), voxel), dim=0)
     anchors = cells.double() * voxel
-    extent = float(torch.quantile(anchors.norm(dim=-1).float(), 0.99)) or 1.0
     spacing = neighbour_distance(anchors.numpy()).clip(1e-4 * extent, 0.1 * extent)
     generator = streams["init"]
     count, scene = len(anchors), config.scene
@@ -74,17 +76,11 @@ def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, stream
         scene,
         scaffold,
         extent=extent,
-        sampling=Sampling.of([frame.camera for frame in capture.train], extent),
+        sampling=sampling,
         initial_opacity=config.init.opacity,
         seed=config.seed,
     )
     return Start(made, voxel, window)
-
-
-def pixel_footprint(capture: Capture) -> float:
-    """Median size of one training pixel at the scene's centre, normalised units."""
-    sizes = [abs(float(np.linalg.norm(frame.camera.center))) / frame.camera.fx for frame in capture.train]
-    return max(float(np.median(sizes)), 1e-6)
 
 
 def first_points(
