@@ -27,31 +27,19 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from working_copy import WorkingCopy
+
 ROOT = Path(__file__).resolve().parent.parent
-COPIED = ("graings", "tests", "CMakeLists.txt", "pyproject.toml")
 SOURCE = "graings/kernel/csrc"
 RASTER = ("tests/raster",)
 FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)
 IN_A_TEST = re.compile(r"^(tests/\S+::.*\S) \Z", re.MULTILINE)  # begun, and no word of how it ended
-
-# An installed package may be found by an import finder of its own, before the working folder: without it.
-RUN_PYTEST = """
-import sys
-sys.meta_path = [finder for finder in sys.meta_path if "ScikitBuild" not in type(finder).__name__]
-sys.path.insert(0, sys.argv[1])
-import graings
-assert graings.__file__.startswith(sys.argv[1]), graings.__file__
-import pytest
-sys.exit(pytest.main(sys.argv[2:]))
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -394,53 +382,28 @@ MUTANTS = (
 )
 
 
-class Copy:
-    """The package in a folder of its own, where it may be changed, built and tested."""
+def apply(copy: WorkingCopy, mutant: Mutant) -> str:
+    """Change the source; returns what it was. Raises `SystemExit` where the text is not there once."""
+    path = copy.folder / mutant.file
+    before = path.read_text(encoding="utf-8")
+    if (count := before.count(mutant.old)) != 1:
+        raise SystemExit(f"mutant {mutant.name}: its text occurs {count} times in {mutant.file}, expected once")
+    path.write_text(before.replace(mutant.old, mutant.new), encoding="utf-8")
+    return before
 
-    def __init__(self, folder: Path, jobs: int) -> None:
-        self.folder, self.jobs = folder, jobs
-        for name in COPIED:
-            source, target = ROOT / name, folder / name
-            if source.is_dir():
-                shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "_kernel*"))
-            else:
-                shutil.copy2(source, target)
-        self._run(
-            "cmake", "-S", ".", "-B", "build", "-DCMAKE_BUILD_TYPE=Release", f"-DPython_EXECUTABLE={sys.executable}"
-        )
 
-    def build(self) -> None:
-        self._run("cmake", "--build", "build", "--target", "_kernel", "--parallel", str(self.jobs))
-        for module in (self.folder / "build").glob("_kernel*.so"):
-            shutil.copy2(module, self.folder / "graings/kernel")
+def failures(copy: WorkingCopy, tests: Sequence[str], *options: str) -> list[str]:
+    """Ids of the tests that fail, or of the one in which a signal ended the interpreter.
 
-    def apply(self, mutant: Mutant) -> str:
-        """Change the source; returns what it was. Raises `SystemExit` where the text is not there once."""
-        path = self.folder / mutant.file
-        before = path.read_text(encoding="utf-8")
-        if (count := before.count(mutant.old)) != 1:
-            raise SystemExit(f"mutant {mutant.name}: its text occurs {count} times in {mutant.file}, expected once")
-        path.write_text(before.replace(mutant.old, mutant.new), encoding="utf-8")
-        return before
-
-    def failures(self, tests: Sequence[str], *options: str) -> list[str]:
-        """Ids of the tests that fail, or of the one in which a signal ended the interpreter.
-
-        Raises `SystemExit` where they could not be run at all.
-        """
-        command = [sys.executable, "-c", RUN_PYTEST, str(self.folder), "-v", "-m", "not slow", "-p", "no:cacheprovider"]
-        ran = subprocess.run([*command, *options, *tests], cwd=self.folder, capture_output=True, text=True, check=False)
-        failed = FAILED.findall(ran.stdout)
-        if ran.returncode < 0 and (ended := IN_A_TEST.search(ran.stdout)):
-            return [ended[1]]
-        if ran.returncode not in (0, 1) or (ran.returncode == 1) != bool(failed):
-            raise SystemExit(f"pytest could not run:\n{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}")
-        return failed
-
-    def _run(self, *command: str) -> None:
-        ran = subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False)
-        if ran.returncode != 0:
-            raise SystemExit(f"{' '.join(command)} failed:\n{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}")
+    Raises `SystemExit` where they could not be run at all.
+    """
+    ran = copy.pytest("-v", "-m", "not slow", *options, *tests)
+    failed = FAILED.findall(ran.stdout)
+    if ran.returncode < 0 and (ended := IN_A_TEST.search(ran.stdout)):
+        return [ended[1]]
+    if ran.returncode not in (0, 1) or (ran.returncode == 1) != bool(failed):
+        raise SystemExit(f"pytest could not run:\n{ran.stdout[-4000:]}\n{ran.stderr[-4000:]}")
+    return failed
 
 
 def chosen(only: str | None) -> list[Mutant]:
@@ -460,22 +423,22 @@ def check_texts(mutants: Sequence[Mutant]) -> None:
             raise SystemExit(f"mutant {mutant.name}: its text occurs {count} times in {mutant.file}, expected once")
 
 
-def try_mutants(copy: Copy, mutants: Sequence[Mutant]) -> dict[str, str | None]:
+def try_mutants(copy: WorkingCopy, mutants: Sequence[Mutant]) -> dict[str, str | None]:
     """The first test that notices each mutant, None where none does."""
     copy.build()
     tests = sorted({test for mutant in mutants for test in mutant.tests})
-    broken = copy.failures(tests)
+    broken = failures(copy, tests)
     for test in broken:
         print(f"fails already, left out: {test}", flush=True)
     deselected = [f"--deselect={test}" for test in broken]
     noticed: dict[str, str | None] = {}
     built_as_is = True
     for mutant in mutants:
-        before = copy.apply(mutant)
+        before = apply(copy, mutant)
         if mutant.needs_build or not built_as_is:
             copy.build()
             built_as_is = not mutant.needs_build
-        failed = copy.failures(mutant.tests, "-x", *deselected)
+        failed = failures(copy, mutant.tests, "-x", *deselected)
         (copy.folder / mutant.file).write_text(before, encoding="utf-8")
         noticed[mutant.name] = failed[0] if failed else None
         print(f"{mutant.name:13} {mutant.what:52} {noticed[mutant.name] or 'SURVIVED'}", flush=True)
@@ -499,10 +462,10 @@ def main() -> int:
         return 0
     if options.keep is not None:
         options.keep.mkdir(parents=True)
-        noticed = try_mutants(Copy(options.keep.resolve(), options.jobs), mutants)
+        noticed = try_mutants(WorkingCopy(ROOT, options.keep.resolve(), options.jobs), mutants)
     else:
         with tempfile.TemporaryDirectory() as folder:
-            noticed = try_mutants(Copy(Path(folder).resolve(), options.jobs), mutants)
+            noticed = try_mutants(WorkingCopy(ROOT, Path(folder).resolve(), options.jobs), mutants)
     survivors = [name for name, test in noticed.items() if test is None]
     print(
         f"{len(noticed) - len(survivors)} of {len(noticed)} noticed"
