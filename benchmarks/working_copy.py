@@ -30,6 +30,8 @@ class WorkingCopy:
     """A copy of `root` in `folder`, configured with CMake's `options` and built by `build` with `jobs` compilers."""
 
     def __init__(self, root: Path, folder: Path, jobs: int, *options: str) -> None:
+        if shutil.which("cmake") is None:
+            raise SystemExit("CMake is not installed, which builds the kernel here: pip install cmake")
         self.folder, self.jobs = folder, jobs
         for name in COPIED:
             source, target = root / name, folder / name

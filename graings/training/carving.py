@@ -94,7 +94,8 @@ def coverage(points: NDArray[np.float64], views: Sequence[Masked], cells: int) -
     """Share of its least covered piece that lies within a cell of a point, as all but the `WORSE` of `views` have it.
 
     What hangs together in a picture is one piece: where a part of it has points the rest can grow, and a thing of its
-    own that has none is not found. A picture's longer side is `cells` long. 1 where no view shows anything.
+    own that has none is not found. `points` [M, 3] are in normalised units, and a picture's longer side is `cells`
+    long. 1 where no view shows anything.
     """
     shares = []
     for view in views:
@@ -103,10 +104,10 @@ def coverage(points: NDArray[np.float64], views: Sequence[Masked], cells: int) -
             continue
         size = max(1, -(-max(camera.width, camera.height) // cells))
         columns, rows, inside = project(points, camera)
-        shape = -(-camera.height // size), -(-camera.width // size)
-        near, shown = np.zeros(shape, np.bool_), np.zeros(shape)
+        down, across = np.arange(0, camera.height, size), np.arange(0, camera.width, size)
+        shown = np.add.reduceat(np.add.reduceat(view.mask, down, axis=0, dtype=np.int64), across, axis=1)
+        near = np.zeros(shown.shape, np.bool_)
         near[rows[inside] // size, columns[inside] // size] = True
-        np.add.at(shown, tuple(index // size for index in view.mask.nonzero()), 1)
         pieces = _pieces(shown > 0).ravel()
         whole = np.bincount(pieces, shown.ravel())
         covered = np.bincount(pieces, np.where(_dilated(near, 1), shown, 0).ravel())
