@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from graings.camera import Sampling
 from graings.capture.capture import Capture
@@ -58,11 +59,11 @@ class Start:
 def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams) -> Start:
     """A scene of the first anchors. Raises `CaptureError` where no image shows anything."""
     points, window = first_points(capture, images, config, streams)
-    extent = float(torch.quantile(torch.from_numpy(points).norm(dim=-1).float(), 0.99)) or 1.0
-    sampling = Sampling.of([frame.camera for frame in capture.train], extent)
-    voxel = config.init.voxel_size or VOXEL_PER_PIXEL / sampling.reference
-    cells = torch.unique(voxel_keys(torch.from_numpy(points), voxel), dim=0)
-    anchors = cells.double() * voxel
+    cameras = [frame.camera for frame in capture.train]
+    places = torch.from_numpy(points)
+    voxel = config.init.voxel_size or VOXEL_PER_PIXEL / Sampling.of(cameras, content_extent(places)).reference
+    anchors = torch.unique(voxel_keys(places, voxel), dim=0).double() * voxel
+    extent = content_extent(anchors)  # where each place counts once, however many points a cloud has there
     spacing = neighbour_distance(anchors.numpy()).clip(1e-4 * extent, 0.1 * extent)
     generator = streams["init"]
     count, scene = len(anchors), config.scene
@@ -76,11 +77,16 @@ def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, stream
         scene,
         scaffold,
         extent=extent,
-        sampling=sampling,
+        sampling=Sampling.of(cameras, extent),
         initial_opacity=config.init.opacity,
         seed=config.seed,
     )
     return Start(made, voxel, window)
+
+
+def content_extent(points: Tensor) -> float:
+    """Radius about the origin that holds all but a hundredth of `points` [M, 3], normalised units; 1 where it is 0."""
+    return float(torch.quantile(points.norm(dim=-1).float(), 0.99)) or 1.0
 
 
 def first_points(
