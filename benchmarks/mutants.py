@@ -371,7 +371,21 @@ MUTANTS = (
         "v = product(v, turn(moved));",
         SCENE,
     ),
-    Mutant("rim", "differing part one pixel too narrow", f"{SOURCE}/photometric.cpp", "kRim = 10;", "kRim = 9;"),
+    Mutant("rim", "differing part one pixel too narrow", f"{SOURCE}/photometric.cpp", "kReach = 5;", "kReach = 4;"),
+    Mutant(
+        "stale",
+        "what no window saw keeps another picture's gradient",
+        f"{SOURCE}/ssim.hpp",
+        "std::memset(map, 0, sizeof(R) * size_t(args.windows[y].begin));",
+        "",
+    ),
+    Mutant(
+        "cut-off",
+        "a row's window sums only what has a say itself",
+        f"{SOURCE}/ssim.hpp",
+        "along<R>(reached(args.windows[y], length)",
+        "along<R>(args.windows[y]",
+    ),
     Mutant(
         "square",
         "squares without the two of their gradient",

@@ -1,6 +1,7 @@
 #include "photometric.hpp"
 
 #include <algorithm>
+#include <vector>
 
 #include "buffer.hpp"
 #include "isa.hpp"
@@ -10,27 +11,34 @@ namespace graings {
 
 namespace {
 
-struct Part {
-    int64_t top, bottom, left, right;  // rows and columns [top, bottom) x [left, right)
-};
+constexpr int64_t kReach = 5;  // of the window, in pixels
 
-// The part of two images that they differ in, with a rim of twice the window's radius. Outside, similarity is 1 and
-// the gradient 0: no window there sees a difference, whatever lies beyond the rim. NaN differs from everything.
+// Of each row of two images the pixels from the first that differs to the last; none: [width, 0). NaN differs from all.
 template <class R>
-Part differing(int64_t height, int64_t width, const R* image, const R* target) {
-    constexpr int64_t kRim = 10;
-    Part part{height, 0, width, 0};
+std::vector<Range> differing(int64_t height, int64_t width, const R* image, const R* target) {
+    std::vector<Range> parts(size_t(height), Range{width, 0});
     for (int64_t y = 0; y < height; y++) {
         const R *a = image + 3 * y * width, *b = target + 3 * y * width;
         int64_t first = 0, last = 3 * width;
         while (first < last && a[first] == b[first]) first++;
         if (first == last) continue;
         while (a[last - 1] == b[last - 1]) last--;
-        part.top = std::min(part.top, y), part.bottom = y + 1;
-        part.left = std::min(part.left, first / 3), part.right = std::max(part.right, (last + 2) / 3);
+        parts[size_t(y)] = {first / 3, (last + 2) / 3};
     }
-    if (part.top >= part.bottom) return {0, 0, 0, 0};
-    return {std::max<int64_t>(0, part.top - kRim), std::min(height, part.bottom + kRim), std::max<int64_t>(0, part.left - kRim), std::min(width, part.right + kRim)};
+    return parts;
+}
+
+// Of each row what lies within the window's reach of the parts.
+std::vector<Range> widened(const std::vector<Range>& parts, int64_t width) {
+    const int64_t height = int64_t(parts.size());
+    std::vector<Range> wide(parts.size(), Range{width, 0});
+    for (int64_t y = 0; y < height; y++) {
+        Range& all = wide[size_t(y)];
+        for (int64_t row = std::max<int64_t>(0, y - kReach); row < std::min(height, y + kReach + 1); row++)
+            all.begin = std::min(all.begin, parts[size_t(row)].begin), all.end = std::max(all.end, parts[size_t(row)].end);
+        if (all.begin < all.end) all = {std::max<int64_t>(0, all.begin - kReach), std::min(width, all.end + kReach)};
+    }
+    return wide;
 }
 
 }  // namespace
@@ -39,25 +47,44 @@ template <class R>
 Likeness compare(int64_t height, int64_t width, const R* image, const R* target, Likeness weights, R* gradient, int threads) {
     constexpr int64_t kBand = 16;  // rows
     const Kernels<R>& run = kernels<R>();
-    const Part part = differing(height, width, image, target);
-    const int64_t rows = part.bottom - part.top, columns = part.right - part.left, first = 3 * (part.top * width + part.left);
+    // No window beyond `windows` sees a difference, and none that does pulls at anything beyond `pulled`.
+    std::vector<Range> windows = widened(differing(height, width, image, target), width), pulled = widened(windows, width);
+    Range across{width, 0}, down{height, 0};
+    for (int64_t y = 0; y < height; y++) {
+        const Range& row = pulled[size_t(y)];
+        if (row.begin >= row.end) continue;
+        across = {std::min(across.begin, row.begin), std::max(across.end, row.end)};
+        down = {std::min(down.begin, y), y + 1};
+    }
+    if (down.begin >= down.end) across = down = {0, 0};
+    const int64_t rows = down.end - down.begin, columns = across.end - across.begin, first = 3 * (down.begin * width + across.begin);
+    const auto numbers = [&](std::vector<Range>& parts) {  // from pixels of the image to numbers of its part
+        int64_t count = 0;
+        for (Range& part : parts) {
+            part = part.begin < part.end ? Range{3 * (part.begin - across.begin), 3 * (part.end - across.begin)} : Range{0, 0};
+            count += part.end - part.begin;
+        }
+        return count;
+    };
+    const int64_t all = 3 * height * width, seen = numbers(windows), written = numbers(pulled);
     const int64_t bands = (rows + kBand - 1) / kBand, row = 3 * columns + 2 * 15 + 2 * kLanes;
-    const double scale = 1.0 / (3.0 * double(height) * double(width));
+    const double scale = 1.0 / double(all);
     Buffer<double> sums{size_t(3 * bands)};
     Buffer<R> maps(gradient ? size_t(9 * rows * columns) : 1), scratch(size_t(threads) * size_t(5 * row));
-    const SsimArgs<R> args{rows, columns, 3 * width, image + first, target + first, gradient ? gradient + first : nullptr, gradient ? maps.get() : nullptr, sums.get(),
+    const SsimArgs<R> args{rows, columns, 3 * width, image + first, target + first, windows.data() + down.begin, pulled.data() + down.begin,
+                           gradient ? gradient + first : nullptr, gradient ? maps.get() : nullptr, sums.get(),
                            R(weights.similarity * scale), R(weights.absolute * scale), R(weights.squared * scale)};
-    if (gradient && rows * columns < height * width) std::fill_n(gradient, 3 * height * width, R(0));
+    if (gradient && written < all) std::fill_n(gradient, all, R(0));
     const auto end = [&](int64_t band) { return std::min(rows, (band + 1) * kBand); };
     parallel_for(threads, bands, [&](int worker, int64_t band) { run.ssim_values(args, band, band * kBand, end(band), scratch.get() + worker * 5 * row); });
     if (gradient)
         parallel_for(threads, bands, [&](int worker, int64_t band) { run.ssim_gradient(args, band * kBand, end(band), scratch.get() + worker * 5 * row); });
-    Likeness mean{1.0 - double(rows * columns) / (double(height) * double(width)), 0.0, 0.0};
+    Likeness sum{double(all - seen), 0.0, 0.0};
     for (int64_t band = 0; band < bands; band++) {
         const double* of_band = sums.get() + 3 * band;
-        mean.similarity += of_band[0] * scale, mean.absolute += of_band[1] * scale, mean.squared += of_band[2] * scale;
+        sum.similarity += of_band[0], sum.absolute += of_band[1], sum.squared += of_band[2];
     }
-    return mean;
+    return {sum.similarity / double(all), sum.absolute / double(all), sum.squared / double(all)};
 }
 
 template Likeness compare<float>(int64_t, int64_t, const float*, const float*, Likeness, float*, int);

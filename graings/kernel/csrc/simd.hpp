@@ -54,8 +54,6 @@ GRAINGS_INLINE Native<double> least(Native<double> a, Native<double> b) { return
 GRAINGS_INLINE Native<float> most(Native<float> a, Native<float> b) { return (Native<float>)_mm512_max_ps((__m512)a, (__m512)b); }
 GRAINGS_INLINE Native<double> most(Native<double> a, Native<double> b) { return (Native<double>)_mm512_max_pd((__m512d)a, (__m512d)b); }
 GRAINGS_INLINE Native<double> root(Native<double> a) { return (Native<double>)_mm512_sqrt_pd((__m512d)a); }
-GRAINGS_INLINE float total(Native<float> a) { return _mm512_reduce_add_ps((__m512)a); }
-GRAINGS_INLINE double total(Native<double> a) { return _mm512_reduce_add_pd((__m512d)a); }
 GRAINGS_INLINE Native<float> joined(Native<double> lo, Native<double> hi) {
     return (Native<float>)_mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps((__m512d)lo)), _mm512_cvtpd_ps((__m512d)hi), 1);
 }
@@ -65,7 +63,7 @@ GRAINGS_INLINE Native<float> joined(Native<double> lo, Native<double> hi) {
 #if defined(__AVX2__)
     return (Native<float>)_mm256_set_m128(_mm256_cvtpd_ps((__m256d)hi), _mm256_cvtpd_ps((__m256d)lo));
 #else
-    Native<float> both;
+    Native<float> both{};
     for (int i = 0; i < 2; i++) both[i] = float(lo[i]), both[i + 2] = float(hi[i]);
     return both;
 #endif
@@ -73,36 +71,30 @@ GRAINGS_INLINE Native<float> joined(Native<double> lo, Native<double> hi) {
 template <class V> GRAINGS_INLINE auto less(V a, V b) { return a < b; }
 template <class V> GRAINGS_INLINE auto less_equal(V a, V b) { return a <= b; }
 template <class M, class V> GRAINGS_INLINE V choose(M m, V a, V b) { return m ? a : b; }
-template <class M> GRAINGS_INLINE bool some(M m) {
-    bool any = false;
-    for (int i = 0; i < static_cast<int>(sizeof(M) / sizeof(m[0])); i++) any |= m[i] != 0;
-    return any;
-}
 template <class M> GRAINGS_INLINE uint32_t bits_of(M m) {
 #if defined(__AVX2__)
     if constexpr (sizeof(m[0]) == 4) return uint32_t(_mm256_movemask_ps((__m256)m));
     else return uint32_t(_mm256_movemask_pd((__m256d)m));
+#elif defined(__x86_64__)
+    if constexpr (sizeof(m[0]) == 4) return uint32_t(_mm_movemask_ps((__m128)m));
+    else return uint32_t(_mm_movemask_pd((__m128d)m));
 #endif
     uint32_t bits = 0;
     for (int i = 0; i < static_cast<int>(sizeof(M) / sizeof(m[0])); i++) bits |= uint32_t(m[i] != 0) << i;
     return bits;
 }
+template <class M> GRAINGS_INLINE bool some(M m) {
+#if defined(__x86_64__)
+    return bits_of(m) != 0;
+#elif defined(__aarch64__)
+    return vmaxvq_u32((uint32x4_t)m) != 0;
+#endif
+    bool any = false;
+    for (int i = 0; i < static_cast<int>(sizeof(M) / sizeof(m[0])); i++) any |= m[i] != 0;
+    return any;
+}
 template <class V> GRAINGS_INLINE V least(V a, V b) { return a < b ? a : b; }
 template <class V> GRAINGS_INLINE V most(V a, V b) { return a > b ? a : b; }
-GRAINGS_INLINE float total(Native<float> a) {
-    float sum[kNative<float>];
-    std::memcpy(sum, &a, sizeof sum);
-    for (int step = kNative<float> / 2; step > 0; step /= 2)
-        for (int i = 0; i < step; i++) sum[i] += sum[i + step];
-    return sum[0];
-}
-GRAINGS_INLINE double total(Native<double> a) {
-    double sum[kNative<double>];
-    std::memcpy(sum, &a, sizeof sum);
-    for (int step = kNative<double> / 2; step > 0; step /= 2)
-        for (int i = 0; i < step; i++) sum[i] += sum[i + step];
-    return sum[0];
-}
 #if defined(__AVX2__)
 GRAINGS_INLINE Native<float> fused(Native<float> a, Native<float> b, Native<float> c) { return (Native<float>)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
 GRAINGS_INLINE Native<double> fused(Native<double> a, Native<double> b, Native<double> c) { return (Native<double>)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c); }
@@ -196,7 +188,7 @@ GRAINGS_VEC Vec<T, N> select(Mask<T, N> m, Vec<T, N> a, Vec<T, N> b) {
 }
 GRAINGS_VEC bool any(Mask<T, N> m) {
     if constexpr (kOne<T, N>) return some(m.v);
-    else return any(m.lo) || any(m.hi);
+    else return any(m.lo | m.hi);
 }
 // One bit per number, the first lowest.
 GRAINGS_VEC uint32_t bits(Mask<T, N> m) {
@@ -212,6 +204,10 @@ GRAINGS_VEC Vec<T, N> abs(Vec<T, N> a) {
 GRAINGS_VEC Mask<T, N> operator&(Mask<T, N> a, Mask<T, N> b) {
     if constexpr (kOne<T, N>) return {static_cast<NativeMask<T>>(a.v & b.v)};
     else return {a.lo & b.lo, a.hi & b.hi};
+}
+GRAINGS_VEC Mask<T, N> operator|(Mask<T, N> a, Mask<T, N> b) {
+    if constexpr (kOne<T, N>) return {static_cast<NativeMask<T>>(a.v | b.v)};
+    else return {a.lo | b.lo, a.hi | b.hi};
 }
 // Rounded to R and stored.
 template <class R, int N> GRAINGS_INLINE void store_as(R* p, Vec<double, N> a) {
@@ -239,8 +235,13 @@ template <int N, class R> GRAINGS_INLINE Vec<double, N> load_as(const R* p) {
     } else return {load_as<N / 2>(p), load_as<N / 2>(p + N / 2)};
 }
 GRAINGS_VEC T sum(Vec<T, N> a) {
-    if constexpr (kOne<T, N>) return total(a.v);
-    else return sum(a.lo + a.hi);
+    if constexpr (kOne<T, N>) {
+        T sums[N];
+        store(sums, a);
+        for (int step = N / 2; step > 0; step /= 2)
+            for (int i = 0; i < step; i++) sums[i] += sums[i + step];
+        return sums[0];
+    } else return sum(a.lo + a.hi);
 }
 GRAINGS_VEC Vec<T, N> clamp(Vec<T, N> x, Vec<T, N> low, Vec<T, N> high) { return min(max(x, low), high); }
 // p * 2^n, where `shifted` = n + 1.5 * 2^mantissa holds the integer n in its low bits

@@ -52,6 +52,20 @@ GRAINGS_INLINE void by_block(const uint16_t (&masks)[kChunk], uint64_t (&entries
         const __m512i bit = _mm512_set1_epi16(short(1 << b));
         entries[b] = uint64_t(_mm512_test_epi16_mask(low, bit)) | uint64_t(_mm512_test_epi16_mask(high, bit)) << 32;
     }
+#elif defined(__AVX2__)
+    // The bit at the top of each mask, then of a byte for each, is its sign. Packing keeps halves of registers apart.
+    __m256i low[2], high[2];
+    for (int half = 0; half < 2; half++) {
+        const __m256i a = _mm256_loadu_si256((const __m256i*)(masks + 32 * half)), b = _mm256_loadu_si256((const __m256i*)(masks + 32 * half + 16));
+        low[half] = _mm256_permute2x128_si256(a, b, 0x20), high[half] = _mm256_permute2x128_si256(a, b, 0x31);
+    }
+    for (int b = 0; b < kBlocks; b++) {
+        const auto of_half = [&](int half) {
+            const __m128i by = _mm_cvtsi32_si128(kBlocks - 1 - b);
+            return uint32_t(_mm256_movemask_epi8(_mm256_packs_epi16(_mm256_sll_epi16(low[half], by), _mm256_sll_epi16(high[half], by))));
+        };
+        entries[b] = of_half(0) | uint64_t(of_half(1)) << 32;
+    }
 #else
     std::memset(entries, 0, sizeof entries);
     for (int j = 0; j < kChunk; j++)

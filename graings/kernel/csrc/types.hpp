@@ -137,11 +137,15 @@ struct GeometryGradientArgs {
     R *v_means, *v_quats, *v_log_scales, *v_opacities, *v_colors, *v_offset;  // v_offset may be null
 };
 
+struct Range { int64_t begin, end; };  // [begin, end)
+
 template <class R>
 struct SsimArgs {
     int64_t height, width;
     int64_t row;    // numbers from one row of image, target and gradient to the next
     const R *image, *target;
+    const Range* windows;  // of each row, the numbers whose window sees a difference: elsewhere similarity is 1
+    const Range* pulled;   // and those that such a window pulls at: elsewhere the gradient is 0, and is not written
     R* gradient;    // [height, width, 3] or null
     R* maps;        // three planes [height, width, 3]: what the gradient filters back
     double* sums;   // per band: of the similarity, of |image - target| and of its square
