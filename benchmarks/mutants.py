@@ -364,6 +364,14 @@ MUTANTS = (
         SCENE,
     ),
     Mutant(
+        "mirror",
+        "way back through a mirror without the turn of its normal",
+        f"{SOURCE}/encoding.cpp",
+        "out[i] = R(-2 * (along * v[i] + turned * (direction[i] - 2 * along * normal[i])));",
+        "out[i] = R(-2 * (along * v[i] + turned * direction[i]));",
+        SCENE,
+    ),
+    Mutant(
         "adjoint",
         "gradient turned forwards, not back",
         f"{SOURCE}/children.cpp",

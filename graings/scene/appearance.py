@@ -18,7 +18,6 @@ from graings.scene.encoding import (
     direction_width,
     encoding_width,
     frequency_encoding,
-    mirrored,
 )
 from graings.scene.perceptron import perceptron, weights_and_biases
 from graings.scene.saturate import sigmoid, tanh
@@ -58,12 +57,8 @@ class CanonicalAppearance(nn.Module):
         children: Int64[Tensor, " drawn"],
     ) -> Float[Tensor, "drawn 3"]:
         """c_can of the given flat child slots (anchor * k + child)."""
-        seen = [directions]
-        if self.normal is not None:
-            seen.append(mirrored(directions, self.normal(features)))
-        inputs = torch.cat(
-            [features, *(direction_encoding(towards, self.direction_degree) for towards in seen)], dim=-1
-        )
+        normals = None if self.normal is None else self.normal(features)
+        inputs = torch.cat([features, direction_encoding(directions, self.direction_degree, normals)], dim=-1)
         raw = perceptron(inputs, *weights_and_biases(self.color))
         return sigmoid(raw.view(-1, 3).index_select(0, children))
 

@@ -1,20 +1,23 @@
 """Encodings: frequencies of positions and times, spherical harmonics of directions.
 
-Positions are constants to the networks that read them (Eq. 7), so that the kernel encodes them and nothing is kept
-for a way back. Knows nothing of the networks.
+Positions are constants to the networks that read them (Eq. 7), and directions to the colour head, so that the kernel
+encodes them; of mirrors it knows the way back. Knows nothing of the networks.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from graings import kernel
 
-_NORMAL_EPSILON = 1e-6  # added to a normal's squared length: below a thousandth it fades out instead of spinning
+# Added to a normal's squared length, here and in the kernel: below a thousandth it fades out instead of spinning.
+_NORMAL_EPSILON = 1e-6
 
 
 def encoding_width(dimensions: int, octaves: int) -> int:
@@ -58,11 +61,31 @@ def direction_width(degree: int) -> int:
     return degree * (degree + 2)
 
 
-def direction_encoding(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch width"]:
+def direction_encoding(
+    directions: Float[Tensor, "*batch 3"], degree: int, normals: Float[Tensor, "*batch 3"] | None = None
+) -> Float[Tensor, "*batch width"]:
     """Real spherical harmonics of degrees 1 to `degree` (at most 3) of unit vectors; a bias is that of degree 0.
 
-    Scaled so that those of degree 1 are the direction itself: each has the mean square 1/3 over all directions.
+    Scaled so that those of degree 1 are the direction itself: each has the mean square 1/3 over all directions. With
+    `normals` as many more follow, of the directions `mirrored` there. Differentiable where the two want a gradient.
     """
+    if directions.requires_grad and torch.is_grad_enabled():
+        return plain_direction_encoding(directions, degree, normals)
+    encoded: Tensor = _Directions.apply(directions, normals, degree, kernel.threads())  # type: ignore[no-untyped-call]
+    return encoded
+
+
+def plain_direction_encoding(
+    directions: Float[Tensor, "*batch 3"], degree: int, normals: Float[Tensor, "*batch 3"] | None = None
+) -> Float[Tensor, "*batch width"]:
+    """The oracle of `direction_encoding`, and what it is where `directions` want a gradient."""
+    encoded = _harmonics(directions, degree)
+    if normals is None:
+        return encoded
+    return torch.cat([encoded, _harmonics(mirrored(directions, normals), degree)], dim=-1)
+
+
+def _harmonics(directions: Tensor, degree: int) -> Tensor:
     x, y, z = directions.unbind(-1)
     harmonics = [x, y, z]
     if degree >= 2:
@@ -81,3 +104,27 @@ def direction_encoding(directions: Float[Tensor, "*batch 3"], degree: int) -> Fl
             b * x * (xx - 3 * yy),
         ]
     return torch.stack(harmonics, dim=-1)
+
+
+class _Directions(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, directions: Tensor, normals: Tensor | None, degree: int, threads: int) -> Tensor:
+        directions = directions.detach().contiguous()
+        normals = None if normals is None else normals.detach().contiguous()
+        width = direction_width(degree) * (1 if normals is None else 2)
+        encoded = directions.new_empty(*directions.shape[:-1], width)
+        kernel.kernel().encode_directions(directions, normals, degree, encoded, threads)
+        ctx.save_for_backward(directions, normals)
+        ctx.constants = (degree, threads)
+        return encoded
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        directions, normals = ctx.saved_tensors
+        degree, threads = ctx.constants
+        v_normals = torch.empty_like(normals)
+        kernel.kernel().encode_directions_gradient(
+            directions, normals, degree, upstream.contiguous(), v_normals, threads
+        )
+        return None, v_normals, None, None

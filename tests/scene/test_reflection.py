@@ -1,10 +1,12 @@
 """Highlights: the viewing direction mirrored at a learned normal, and the colour head that sees it."""
 
+import pytest
 import torch
 
+from graings import kernel
 from graings.config import SceneConfig
 from graings.scene.appearance import CanonicalAppearance
-from graings.scene.encoding import mirrored
+from graings.scene.encoding import direction_encoding, direction_width, mirrored, plain_direction_encoding
 
 
 def _units(rows: int, seed: int) -> torch.Tensor:
@@ -62,3 +64,45 @@ def test_surfaces_that_mirror_the_same_direction_look_alike_to_the_harmonics_of_
     views = _units(20, 10)
     normals = target - views  # the mirror that turns each view into the target
     torch.testing.assert_close(mirrored(views, 10 * normals), target.expand(20, 3), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_kernel_says_of_directions_and_mirrors_what_torch_says(degree: int, dtype: torch.dtype) -> None:
+    lengths = torch.logspace(-6, 6, 3000, dtype=torch.float64).unsqueeze(-1)
+    directions, normals = _units(3000, 11).to(dtype), (lengths * _units(3000, 12)).to(dtype).requires_grad_()
+    encoded = direction_encoding(directions, degree, normals)
+    plain_normals = normals.detach().double().requires_grad_()
+    expected = plain_direction_encoding(directions.double(), degree, plain_normals)
+    # Numbers up to 3, computed in float64 by both: each may be off by a unit in the last place of what it is kept in.
+    torch.testing.assert_close(encoded.double(), expected, rtol=0, atol=4 * torch.finfo(dtype).eps)
+    assert torch.equal(direction_encoding(directions, degree), encoded[:, : direction_width(degree)])
+    upstream = torch.randn(expected.shape, dtype=dtype, generator=torch.Generator().manual_seed(13))
+    (gradient,) = torch.autograd.grad(encoded, normals, upstream)
+    (expected_gradient,) = torch.autograd.grad(expected, plain_normals, upstream.double())
+    # A gradient is as large as 1 / |n| until a normal fades; its terms cancel where it is smaller.
+    size = lengths / (lengths.square() + 1e-6)
+    assert ((gradient - expected_gradient).abs() <= 100 * torch.finfo(dtype).eps * size).all()
+
+
+def test_encoded_directions_have_the_gradient_of_differences_in_both() -> None:
+    normals, directions = (2.0 * _units(6, 14)).requires_grad_(), _units(6, 15)
+    assert torch.autograd.gradcheck(lambda n: direction_encoding(directions, 3, n), (normals,))
+    assert torch.autograd.gradcheck(lambda d, n: direction_encoding(d, 3, n), (directions.requires_grad_(), normals))
+
+
+def test_encoded_directions_are_the_same_for_any_number_of_threads() -> None:
+    directions, normals = _units(5000, 16).float(), _units(5000, 17).float()
+
+    def run(threads: int) -> tuple[torch.Tensor, torch.Tensor]:
+        leaf = normals.clone().requires_grad_()
+        kernel.set_threads(threads)
+        try:
+            encoded = direction_encoding(directions, 3, leaf)
+            encoded.square().sum().backward()
+        finally:
+            kernel.set_threads(None)
+        assert leaf.grad is not None
+        return encoded.detach(), leaf.grad
+
+    assert all(torch.equal(*pair) for pair in zip(run(1), run(4), strict=True))

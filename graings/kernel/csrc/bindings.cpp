@@ -91,6 +91,12 @@ graings::Answers<R> answers(const In<R>& canonical, const In<R>& base, const In<
             checked(moved, 10 * drawn, "moved"), extent, {change, low, high, projected}};
 }
 
+// Of a direction, of degrees 1 to `degree`.
+size_t harmonics_of(int degree) {
+    if (degree < 1 || degree > 3) throw std::invalid_argument("harmonics have a degree from 1 to 3");
+    return size_t(degree * (degree + 2));
+}
+
 template <class R>
 void bind_children(nb::module_& m) {
     m.def("gather", [](In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, Out<R> row, Out<R> centre, Out<R> base, int threads) {
@@ -184,6 +190,21 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         R* out = checked(encoded, rows * size_t(dimensions * (1 + 2 * octaves)), "encoded");
         nb::gil_scoped_release release;
         graings::encode<R>(int64_t(rows), dimensions, octaves, x.data(), out, threads);
+    });
+    m.def("encode_directions", [](In<R> directions, std::optional<In<R>> normals, int degree, Out<R> encoded, int threads) {
+        const size_t rows = directions.size() / 3, width = harmonics_of(degree) * (normals ? 2 : 1);
+        const R *from = checked(directions, 3 * rows, "directions"), *at = checked(normals, 3 * rows, "normals");
+        R* out = checked(encoded, rows * width, "encoded");
+        nb::gil_scoped_release release;
+        graings::encode_directions<R>(int64_t(rows), degree, from, at, out, threads);
+    });
+    m.def("encode_directions_gradient", [](In<R> directions, In<R> normals, int degree, In<R> v_encoded, Out<R> v_normals, int threads) {
+        const size_t rows = directions.size() / 3;
+        const R *from = checked(directions, 3 * rows, "directions"), *at = checked(normals, 3 * rows, "normals");
+        const R* upstream = checked(v_encoded, 2 * rows * harmonics_of(degree), "v_encoded");
+        R* out = checked(v_normals, 3 * rows, "v_normals");
+        nb::gil_scoped_release release;
+        graings::encode_directions_gradient<R>(int64_t(rows), degree, from, at, upstream, out, threads);
     });
     m.def("network", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, std::optional<In<R>> shared, std::optional<In<int64_t>> group,
                         Out<R> output, std::optional<Out<R>> hidden, int threads) {

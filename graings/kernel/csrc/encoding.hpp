@@ -1,4 +1,4 @@
-// Frequency encoding of positions. Knows nothing of what reads it.
+// Frequencies of positions, and spherical harmonics of directions. Knows nothing of what reads them.
 #pragma once
 #include <cstdint>
 
@@ -8,5 +8,15 @@ namespace graings {
 // l of a coordinate side by side. Values are those of float64, rounded to R.
 template <class R>
 void encode(int64_t rows, int64_t dimensions, int octaves, const R* x, R* out, int threads);
+
+// out [rows, width] of unit vectors [rows, 3]: real spherical harmonics of degrees 1 to `degree`, at most 3, scaled so that
+// the first three are the direction itself; width = degree (degree + 2). With `normals` [rows, 3], of any length, as many
+// more behind them: of the directions mirrored there.
+template <class R>
+void encode_directions(int64_t rows, int degree, const R* directions, const R* normals, R* out, int threads);
+
+// The gradient with respect to `normals`.
+template <class R>
+void encode_directions_gradient(int64_t rows, int degree, const R* directions, const R* normals, const R* v_out, R* v_normals, int threads);
 
 }  // namespace graings
