@@ -29,7 +29,7 @@ class _Saturating(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
         tail = (ctx.stretch * x).abs_().neg_().exp_()
-        return ctx.stretch**2 * grad_outputs[0] * (tail / (1.0 + tail).square_()), None, None
+        return tail.div_((1.0 + tail).square_()).mul_(grad_outputs[0]).mul_(ctx.stretch**2), None, None
 
 
 def tanh(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
