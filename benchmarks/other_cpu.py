@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -88,6 +89,9 @@ def main() -> int:
     parser.add_argument("--compiler", default="aarch64-linux-gnu-g++")
     parser.add_argument("--emulator", default="qemu-aarch64")
     options = parser.parse_args()
+    for tool in ("g++", options.compiler, options.emulator):
+        if shutil.which(tool) is None:
+            raise SystemExit(f"{tool} is not installed (Debian: apt-get install g++-aarch64-linux-gnu qemu-user)")
     with tempfile.TemporaryDirectory() as name:
         here, there = Path(name) / "here", Path(name) / "there"
         here.mkdir()
