@@ -63,11 +63,19 @@ void pictures() {
     write("v_background", v_background), write("v_means", v_means), write("v_quats", v_quats), write("v_log_scales", v_log_scales);
     write("v_opacities", v_opacities), write("v_colors", v_colors);
 
-    const auto target = from.many<R>(3 * pixels, 0, 1);
-    std::vector<R> likeness(3), v_image(3 * pixels);
-    const auto mean = graings::compare<R>(height, width, color.data(), target.data(), {-0.2, 0.8, 10}, v_image.data(), 2);
-    likeness = {R(mean.similarity), R(mean.absolute), R(mean.squared)};
-    write("likeness", likeness), write("v_image", v_image);
+    const auto comparison = [&](const std::string& name, const std::vector<R>& target) {
+        std::vector<R> gradient(3 * pixels);
+        const auto mean = graings::compare<R>(height, width, color.data(), target.data(), {-0.2, 0.8, 10}, gradient.data(), 2);
+        write((name + "_likeness").c_str(), std::vector<R>{R(mean.similarity), R(mean.absolute), R(mean.squared)});
+        write((name + "_v_image").c_str(), gradient);
+    };
+    const auto other = from.many<R>(3 * pixels, 0, 1);
+    comparison("other", other);
+    std::vector<R> partly = color;  // differs in a slanted stripe: another part of each row, and none of some
+    for (int64_t i = 0; i < pixels; i++)
+        if (const int64_t x = i % width, y = i / width; y > 20 && y < 90 && (x + 2 * y) % 97 < 3)
+            for (int64_t c = 3 * i; c < 3 * i + 3; c++) partly[size_t(c)] = other[size_t(c)];
+    comparison("partly", partly);
 }
 
 template <class R>
