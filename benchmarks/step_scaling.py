@@ -23,6 +23,7 @@ from training_step import Stopwatch, measured_step
 from graings import kernel
 from graings.capture.load import load_capture
 from graings.training.average import Average
+from graings.training.pyramid import Pyramid
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 
@@ -47,6 +48,7 @@ def trainer_of(options: argparse.Namespace, share: float, side: int | None) -> T
     trainer.iteration = min(trainer.iteration, run.iterations - options.steps - 10)
     if side is not None:
         trainer.capture = load_capture(run.capture.root, run.config.capture.model_copy(update={"max_side": side}))
+        trainer.pyramid = Pyramid(trainer.config, trainer.capture.train, float(trainer.scene.extent))
     if share < 1:
         count = trainer.scene.scaffold.count
         keep = torch.rand(count, generator=torch.Generator().manual_seed(0)) < share

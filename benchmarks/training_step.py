@@ -56,7 +56,7 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     watch.start()
     targets = [torch.from_numpy(trainer.images.rgb(frame)) for frame in frames]
     for view in trainer._upcoming():
-        trainer.images.prefetch(trainer.capture.train[view])
+        trainer.images.prefetch(trainer.pyramid.at(trainer.iteration + 1).frames[view])
     watch.lap("images")
     compositions = trainer.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
     watch.lap("scene forward")

@@ -263,6 +263,12 @@ class TrainConfig(Part):
     time_window_until: int = Field(
         7_500, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."
     )
+    small_until: int = Field(
+        15_000,
+        ge=0,
+        description="Mark of the 30 000 schedule until which training looks at smaller pictures: a half of each side, "
+        "or a quarter before, and so on, as long as 200 px remain. 0: never.",
+    )
     matrix_step: Literal["muon", "adam"] = Field(
         "muon",
         description="How weight matrices of StaticMLP and DeformNet step. muon: orthogonalised momentum; adam: as the "
@@ -295,7 +301,7 @@ _FAR_FALLEN: Final[dict[str, Any]] = {
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         # Many views of few Gaussians: what moves is found sooner than with few views of many.
-        "iterations": 1_000,
+        "iterations": 1_100,
         "batch": 4,
         # Gradients of the first steps, which find the colour of everything, do not say where detail is missing.
         "density": {
@@ -308,11 +314,12 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rates": {"offsets": (0.03, 1e-3), "matrices": (8e-3, 2e-4)},
     },
     "standard": {},
-    "fine": {"iterations": 15_000, "rates": _FAR_FALLEN},
+    "fine": {"iterations": 15_000, "small_until": 0, "rates": _FAR_FALLEN},
     # As the paper trains: one view a step. With four, half as many rounds of growth a view are enough.
     "paper": {
         "iterations": PAPER_ITERATIONS,
         "batch": 1,
+        "small_until": 0,
         "density": {"grow_every": 100, "gradient_threshold": 3e-4},
         "rates": _FAR_FALLEN,
     },
@@ -351,7 +358,13 @@ def restored(kind: type[Stored], values: Any, source: Path) -> Stored:
 def restored_training(values: Any, source: Path) -> TrainConfig:
     """As `restored`, for options of a run: what an older file does not name is as it was when there was no choice."""
     if isinstance(values, dict):
-        before = {"matrix_step": "adam", "average_from": PAPER_ITERATIONS, "time_window": 1.0, "batch": 1}
+        before = {
+            "matrix_step": "adam",
+            "average_from": PAPER_ITERATIONS,
+            "time_window": 1.0,
+            "batch": 1,
+            "small_until": 0,
+        }
         values = before | values
         for part, earlier in (("loss", {"rigidity": 0.0, "squared": 0.0}), ("scene", SHAPE_BEFORE)):
             if isinstance(values.get(part), dict):

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from graings.camera import Camera, Sampling, View
 from graings.config import TrainConfig, restored_shape, restored_training
+from graings.resolution import shrinking, shrunk
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.units import Units
@@ -73,11 +74,13 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
     rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
     views = {split: tuple(map(_view_from_json, members)) for split, members in facts["views"].items()}
     extent = float(tensors["extent"])
+    cameras = [view.camera for view in views["train"]]
+    times = shrinking(config, cameras, facts["iteration"])
     scene = Scene(
         shape,
         Scaffold(**rows),
         extent=extent,
-        sampling=Sampling.of([view.camera for view in views["train"]], extent),
+        sampling=Sampling.of([shrunk(camera, times) for camera in cameras], extent),
         initial_opacity=0.1,
     )
     scene.load_state_dict(tensors)

@@ -289,7 +289,7 @@ def test_options_as_json_are_the_schema(capsys: pytest.CaptureFixture[str]) -> N
     assert graings("options", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     schedules = {name: (preset["iterations"], preset["batch"]) for name, preset in document["presets"].items()}
-    assert schedules == {"draft": (1_000, 4), "standard": (5_000, 4), "fine": (15_000, 4), "paper": (30_000, 1)}
+    assert schedules == {"draft": (1_100, 4), "standard": (5_000, 4), "fine": (15_000, 4), "paper": (30_000, 1)}
     assert "iterations" in document["schema"]["properties"]
 
 

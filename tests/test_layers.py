@@ -24,6 +24,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.gaussians": (),
     "graings.units": ("graings.camera",),
     "graings.config": ("graings.errors",),
+    "graings.resolution": ("graings.camera", "graings.config"),
     "graings.seeds": (),
     # Three siblings, strangers to each other.
     "graings.capture": ("graings.capture", "graings.camera", "graings.units", "graings.config", "graings.errors"),
@@ -59,7 +60,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     "graings.plan": ("graings.capture.capture", "graings.config"),
     "graings.run_folder": ("graings.errors",),
-    "graings.model": ("graings.camera", "graings.config", "graings.scene", "graings.units"),
+    "graings.model": (*("graings.camera", "graings.config", "graings.resolution", "graings.scene", "graings.units"),),
     "graings.checkpoint": (
         *("graings.camera", "graings.config", "graings.errors", "graings.model", "graings.run_folder"),
         *("graings.scene", "graings.units"),
@@ -76,7 +77,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.training", "graings.capture", "graings.scene", "graings.raster", "graings.render"),
         *("graings.camera", "graings.checkpoint", "graings.config", "graings.constants", "graings.errors"),
         *("graings.evaluation", "graings.machine", "graings.metrics", "graings.plan", "graings.report"),
-        *("graings.gaussians", "graings.run_folder", "graings.units", "graings.threads"),
+        *("graings.gaussians", "graings.resolution", "graings.run_folder", "graings.units", "graings.threads"),
         *("graings.compact", "graings.model", "graings.report_folder", "graings.seeds", "graings.work_precision"),
     ),
     # Many runs. The table and its drawing know numbers, not runs.

@@ -30,6 +30,7 @@ from graings.training.density_control import DensityControl
 from graings.training.guard import Gradient, Guard, first_not_finite
 from graings.training.initialize import make_scene
 from graings.training.optimizer import Optimizer
+from graings.training.pyramid import Pyramid
 from graings.training.regularisers import regularisers
 from graings.training.snapshots import Snapshots
 from graings.training.stiffness import step_over_size
@@ -100,6 +101,7 @@ class Trainer:
         start = make_scene(capture, images, config, self.streams)
         self.scene = start.scene
         self.window = TimeWindow(config, [frame.time for frame in capture.train], start.time_window)
+        self.pyramid = Pyramid(config, capture.train, float(self.scene.extent))
         self.snapshots = Snapshots()
         self._attach(start.voxel_size)
 
@@ -129,10 +131,13 @@ class Trainer:
         self.iteration += 1
         phase = self.phase(self.iteration)
         self.scene.temporal = phase.temporal
+        self.scene.sampling = self.pyramid.at(self.iteration).sampling
+        if self.pyramid.changes(self.iteration):
+            self.guard.trend.begin()
         frames = self.next_frames()
         targets = [torch.from_numpy(self.images.rgb(frame)) for frame in frames]
         for view in self._upcoming():
-            self.images.prefetch(self.capture.train[view])
+            self.images.prefetch(self.pyramid.at(self.iteration + 1).frames[view])
 
         compositions = self.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
         children = compositions[0].children
@@ -214,10 +219,14 @@ class Trainer:
 
     def _opening(self) -> list[str]:
         """At the first step, what was decided before it; in words."""
-        share = self.window.share(1)
-        if self.iteration > 1 or share == 1:
+        if self.iteration > 1:
             return []
-        return [f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens"]
+        events = []
+        if (share := self.window.share(1)) < 1:
+            events.append(f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens")
+        if (times := self.pyramid.at(1).times) > 1:
+            events.append(f"small_until: begins with pictures of 1/{times} of their width and height")
+        return events
 
     def next_frames(self) -> list[Frame]:
         """The views of the next step: of those that take part by now at most `batch`, shared out evenly over a pass."""
@@ -225,7 +234,8 @@ class Trainer:
             self.sampler.begin()  # what is left of this pass does not take part
         while self.sampler.next() != views[-1]:
             pass  # those passed over do not take part
-        return [self.capture.train[view] for view in views]
+        frames = self.pyramid.at(self.iteration).frames
+        return [frames[view] for view in views]
 
     def _upcoming(self) -> list[int]:
         """The views of the next step, as far as this pass goes; none at its end."""

@@ -53,6 +53,10 @@ class Trend:
         """The scene has just been given new anchors."""
         self._settling = SETTLING
 
+    def begin(self) -> None:
+        """From here on losses are of something else: those so far say nothing about them."""
+        self.mean, self.best, self.above, self._count = None, 0.0, 0, 0
+
     @property
     def healthy(self) -> bool:
         """Whether the mean is near the best, so that the moment is worth coming back to."""

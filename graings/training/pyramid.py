@@ -1,0 +1,47 @@
+"""Pyramid: the training views at the sizes at which training looks at them.
+
+Knows nothing of images, models or losses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from graings.camera import Sampling
+from graings.capture.capture import Frame
+from graings.config import TrainConfig
+from graings.resolution import shrinking, shrunk
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """All views at one size: so many `times` smaller along each side than the photographs."""
+
+    times: int
+    frames: tuple[Frame, ...]
+    sampling: Sampling
+
+
+class Pyramid:
+    """`frames` at every size that the schedule of `config` asks for; their content lies within `extent`."""
+
+    def __init__(self, config: TrainConfig, frames: Sequence[Frame], extent: float) -> None:
+        self._config = config
+        self._frames = tuple(frames)
+        self._cameras = [frame.camera for frame in frames]
+        self._extent = extent
+        self._levels: dict[int, Level] = {}
+
+    def at(self, iteration: int) -> Level:
+        """What `iteration` (from 1) looks at."""
+        times = shrinking(self._config, self._cameras, iteration)
+        if times not in self._levels:
+            frames = tuple(replace(frame, camera=shrunk(frame.camera, times)) for frame in self._frames)
+            sampling = Sampling.of([frame.camera for frame in frames], self._extent)
+            self._levels[times] = Level(times, frames, sampling)
+        return self._levels[times]
+
+    def changes(self, iteration: int) -> bool:
+        """Whether `iteration` looks at other sizes than the one before."""
+        return iteration > 1 and self.at(iteration) is not self.at(iteration - 1)
