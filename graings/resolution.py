@@ -25,7 +25,7 @@ def shrinking(config: TrainConfig, cameras: Sequence[Camera], iteration: int) ->
     if max(1, iteration) > until:
         return 1
     longest = max(max(camera.width, camera.height) for camera in cameras)
-    halvings = max(0, int(math.log2(longest / SMALLEST)))
+    halvings = max(0, (longest // SMALLEST).bit_length() - 1)
     return 1 << halvings - halvings * max(0, iteration - 1) // until
 
 

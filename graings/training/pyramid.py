@@ -41,7 +41,3 @@ class Pyramid:
             sampling = Sampling.of([frame.camera for frame in frames], self._extent)
             self._levels[times] = Level(times, frames, sampling)
         return self._levels[times]
-
-    def changes(self, iteration: int) -> bool:
-        """Whether `iteration` looks at other sizes than the one before."""
-        return iteration > 1 and self.at(iteration) is not self.at(iteration - 1)

@@ -131,9 +131,7 @@ class Trainer:
         self.iteration += 1
         phase = self.phase(self.iteration)
         self.scene.temporal = phase.temporal
-        self.scene.sampling = self.pyramid.at(self.iteration).sampling
-        if self.pyramid.changes(self.iteration):
-            self.guard.trend.begin()
+        self._look()
         frames = self.next_frames()
         targets = [torch.from_numpy(self.images.rgb(frame)) for frame in frames]
         for view in self._upcoming():
@@ -227,6 +225,13 @@ class Trainer:
         if (times := self.pyramid.at(1).times) > 1:
             events.append(f"small_until: begins with pictures of 1/{times} of their width and height")
         return events
+
+    def _look(self) -> None:
+        """Have the scene drawn as the pictures of this iteration ask for, whichever size it was at before."""
+        sampling = self.pyramid.at(self.iteration).sampling
+        if sampling != self.scene.sampling:
+            self.scene.sampling = sampling
+            self.guard.trend.begin()
 
     def next_frames(self) -> list[Frame]:
         """The views of the next step: of those that take part by now at most `batch`, shared out evenly over a pass."""
@@ -324,6 +329,7 @@ class Trainer:
         self.iteration = iteration
         self.guard.rolled_back(before)
         self.guard.rollbacks += 1
+        self._look()
         self.collapse.mended = mended
         self._slow_down()
         self.sampler = self._sampler()

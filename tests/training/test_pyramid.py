@@ -129,3 +129,15 @@ def test_losses_of_small_pictures_are_no_measure_for_those_of_large_ones(micro: 
     trainer.guard.trend.best = 1e-9  # whatever comes is far above it
     steps(trainer, 1)
     assert trainer.guard.trend.best == trainer.guard.trend.mean
+
+
+@pytest.mark.usefixtures("begins_small")
+def test_going_back_to_small_pictures_brings_neither_their_losses_nor_their_low_pass(micro: Path) -> None:
+    trainer = _trainer(micro, **{"guard.snapshot_every": 15})
+    steps(trainer, 22)
+    assert trainer.snapshots.newest.scene.sampling == trainer.pyramid.at(15).sampling
+    with torch.no_grad():
+        next(trainer.scene.parameters()).view(-1)[0] = float("nan")
+    assert trainer.check()[0].startswith("rolled back to iteration 15")
+    assert trainer.scene.sampling == trainer.pyramid.at(22).sampling != trainer.pyramid.at(15).sampling
+    assert trainer.guard.trend.mean is None
