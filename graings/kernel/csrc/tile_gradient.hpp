@@ -16,9 +16,12 @@ template <class R> constexpr bool kStreamed = sizeof(R) == 4;
 template <class R> constexpr bool kStreamed = false;
 #endif
 
-// out[q] = sum of the 16 numbers of v[q], for all sums of an entry at once; writes up to kSumStride numbers.
+// A block is gone through in parts of one register, so that ten sums find room in registers.
+template <class R> constexpr int kPart = kNative<R> < kLanes ? kNative<R> : kLanes;
+
+// out[q] = sum of the numbers of v[q], for all sums of an entry at once; writes up to kSumStride numbers.
 template <class R>
-GRAINGS_INLINE void add_lanes(const P<R> (&v)[kSums], R* out) {
+GRAINGS_INLINE void add_lanes(const Vec<R, kPart<R>> (&v)[kSums], R* out) {
 #if defined(__AVX512F__)
     if constexpr (sizeof(R) == 4) {
         // Halve four times, two vectors into one; each keeps its own part of the lanes.
@@ -34,11 +37,10 @@ GRAINGS_INLINE void add_lanes(const P<R> (&v)[kSums], R* out) {
     }
 #elif defined(__AVX2__)
     if constexpr (sizeof(R) == 4) {
-        // Halve four times: the first time alone, then two vectors into one; each keeps its own part of the lanes.
-        const auto half = [](const P<R>& x) { return _mm256_add_ps((__m256)x.lo.v, (__m256)x.hi.v); };
+        // Halve three times, two vectors into one; each keeps its own part of the lanes.
         const auto pairs = [](__m256 a, __m256 b) { return _mm256_add_ps(_mm256_shuffle_ps(a, b, 0x88), _mm256_shuffle_ps(a, b, 0xDD)); };
         __m256 two[5];
-        for (int i = 0; i < 5; i++) two[i] = pairs(half(v[2 * i]), half(v[2 * i + 1]));
+        for (int i = 0; i < 5; i++) two[i] = pairs((__m256)v[2 * i].v, (__m256)v[2 * i + 1].v);
         const __m256 first = pairs(two[0], two[1]), second = pairs(two[2], two[3]), last = pairs(two[4], two[4]);
         _mm256_storeu_ps(out, _mm256_add_ps(_mm256_permute2f128_ps(first, second, 0x20), _mm256_permute2f128_ps(first, second, 0x31)));
         _mm_storeu_ps(out + 8, _mm_add_ps(_mm256_castps256_ps128(last), _mm256_extractf128_ps(last, 1)));
@@ -83,7 +85,7 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     if (begin == end && !v_ground) return;
     const TileBox box = tile_box(args.camera, tile);
     const Rule<R> limits = rule<R>(args.settings);
-    const P<R> rows = load<kLanes>(kRows<R>), zero = p16(R(0));
+    const P<R> zero = p16(R(0));
 
     // upstream: colour, then alpha, then depth
     constexpr int kChannels = Extra ? 5 : 3;
@@ -121,36 +123,40 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         store(behind[b], ground);
     }
 
-    struct Seen {  // of a block of an entry
-        P<R> raw;  // alpha before its cap
-        Distance<R> at;
-        int block;
+    constexpr int N = kPart<R>;
+    using Part = Vec<R, N>;
+    const auto all_of = [](R x) { return splat<R, N>(x); };
+    const Part none = all_of(R(0));
+    struct Seen {  // of a part of an entry's block
+        Part raw;  // alpha before its cap
+        Distance<R, N> at;
+        int block, first;
     };
-    const auto look = [&](const TileEntry<R>& entry, uint32_t mask) {
+    const auto look = [&](const TileEntry<R>& entry, uint32_t mask, int first) {
         const int b = __builtin_ctz(mask);
-        const Distance<R> at = distance(entry, b, rows);
-        return Seen{uncapped_alpha(entry, at), at, b};
+        const Distance<R, N> at = distance<N>(entry, b, first);
+        return Seen{uncapped_alpha(entry, at), at, b, first};
     };
     struct Totals {
-        P<R> e, er, es, err, ers, ess, red, green, blue, depth;
+        Part e, er, es, err, ers, ess, red, green, blue, depth;
     };
     const auto add = [&](Totals& total, const TileEntry<R>& entry, const Seen& seen) {
-        const int b = seen.block;
-        const auto counts = (p16(limits.alpha_min) <= seen.raw) & (p16(entry.number) <= load<kLanes>(last[b]));
-        const P<R> alpha = select(counts, min(seen.raw, p16(limits.alpha_max)), zero);
-        const P<R> before = load<kLanes>(light[b]) / (p16(R(1)) - alpha), weight = alpha * before;
-        store(light[b], before);
-        const P<R> g0 = load<kLanes>(up[0][b]), g1 = load<kLanes>(up[1][b]), g2 = load<kLanes>(up[2][b]);
-        P<R> own = fma(g0, p16(entry.look.red), fma(g1, p16(entry.look.green), g2 * p16(entry.look.blue)));
+        const auto of = [&](R (*lanes)[kLanes]) { return lanes[seen.block] + seen.first; };
+        const auto counts = (all_of(limits.alpha_min) <= seen.raw) & (all_of(entry.number) <= load<N>(last[seen.block] + seen.first));
+        const Part alpha = select(counts, min(seen.raw, all_of(limits.alpha_max)), none);
+        const Part before = load<N>(of(light)) / (all_of(R(1)) - alpha), weight = alpha * before;
+        store(of(light), before);
+        const Part g0 = load<N>(of(up[0])), g1 = load<N>(of(up[1])), g2 = load<N>(of(up[2]));
+        Part own = fma(g0, all_of(entry.look.red), fma(g1, all_of(entry.look.green), g2 * all_of(entry.look.blue)));
         if constexpr (Extra) {
-            const P<R> g4 = load<kLanes>(up[4][b]);
-            own = fma(g4, p16(entry.look.depth), own + load<kLanes>(up[3][b]));
+            const Part g4 = load<N>(of(up[4]));
+            own = fma(g4, all_of(entry.look.depth), own + load<N>(of(up[3])));
             total.depth = fma(weight, g4, total.depth);
         }
-        const P<R> back = load<kLanes>(behind[b]), gain = own - back;
-        store(behind[b], fma(alpha, gain, back));
-        const P<R> ge = select(seen.raw <= p16(limits.alpha_max), weight * gain, zero);  // capped alpha passes none
-        const P<R> ge_r = ge * seen.at.r, ge_s = ge * seen.at.s;
+        const Part back = load<N>(of(behind)), gain = own - back;
+        store(of(behind), fma(alpha, gain, back));
+        const Part ge = select(seen.raw <= all_of(limits.alpha_max), weight * gain, none);  // capped alpha passes none
+        const Part ge_r = ge * seen.at.r, ge_s = ge * seen.at.s;
         total.e = total.e + ge, total.er = total.er + ge_r, total.es = total.es + ge_s;
         total.err = fma(ge_r, seen.at.r, total.err), total.ers = fma(ge_r, seen.at.s, total.ers), total.ess = fma(ge_s, seen.at.s, total.ess);
         total.red = fma(weight, g0, total.red), total.green = fma(weight, g1, total.green), total.blue = fma(weight, g2, total.blue);
@@ -172,9 +178,9 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     };
     for (int j = n - 1; j >= 0 && j > n - 1 - kReadyAhead; j--) make_ready(j);
 
-    const auto clear = [&](Totals& t) { t.e = t.er = t.es = t.err = t.ers = t.ess = t.red = t.green = t.blue = t.depth = zero; };
+    const auto clear = [&](Totals& t) { t.e = t.er = t.es = t.err = t.ers = t.ess = t.red = t.green = t.blue = t.depth = none; };
     const auto put = [&](const Totals& total, int j) {
-        const P<R> totals[kSums] = {total.e, total.er, total.es, total.err, total.ers, total.ess, total.red, total.green, total.blue, Extra ? total.depth : zero};
+        const Part totals[kSums] = {total.e, total.er, total.es, total.err, total.ers, total.ess, total.red, total.green, total.blue, Extra ? total.depth : none};
         add_lanes(totals, sums_of(entries[j].place));
     };
     // Where there are registers enough, a block is looked at before the one looked at last is added up, so that neither
@@ -200,17 +206,18 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         }
         const TileEntry<R>& entry = ready[taken++ % kReady];
         if constexpr (kOverlap) {
-            Seen next = look(entry, mask);
+            Seen next = look(entry, mask, 0);
             if (open >= 0) close();
             open = j, latest = &entry, seen = next, clear(total);
             while (mask &= mask - 1) {
-                next = look(entry, mask);
+                next = look(entry, mask, 0);
                 add(total, entry, seen);
                 seen = next;
             }
         } else {
             clear(total);
-            for (; mask; mask &= mask - 1) add(total, entry, look(entry, mask));
+            for (; mask; mask &= mask - 1)
+                for (int first = 0; first < kLanes; first += N) add(total, entry, look(entry, mask, first));
             put(total, j);
         }
     }

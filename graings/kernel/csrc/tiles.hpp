@@ -84,22 +84,33 @@ GRAINGS_INLINE void by_entry(const uint64_t (&entries)[kBlocks], uint16_t (&mask
     }
     _mm512_storeu_si512(masks, low), _mm512_storeu_si512(masks + 32, high);
 #else
-    std::memset(masks, 0, sizeof masks);
-    for (int b = 0; b < kBlocks; b++)
-        for (int j = 0; j < kChunk; j++) masks[j] |= uint16_t((entries[b] >> j & 1) << b);
+    typedef uint16_t Some __attribute__((vector_size(kBytes)));
+    constexpr int kSome = kBytes / 2;
+    Some bit{};
+    for (int j = 0; j < kSome; j++) bit[j] = uint16_t(1 << j);
+    for (int first = 0; first < kChunk; first += kSome) {
+        Some all{};
+        for (int b = 0; b < kBlocks; b++) {
+            const Some listed = (Some{} + uint16_t(entries[b] >> first)) & bit;
+            all |= (Some)(listed == bit) & uint16_t(1 << b);
+        }
+        std::memcpy(masks + first, &all, sizeof all);
+    }
 #endif
 }
 
-template <class R> struct Distance { P<R> r, s; };
+template <class R, int N = kLanes> struct Distance { Vec<R, N> r, s; };
 
-template <class R>
-GRAINGS_INLINE Distance<R> distance(const TileEntry<R>& entry, int block, P<R> rows) {
-    return {load<kLanes>(entry.lanes) + p16(entry.r[block]), fma(p16(entry.look.sy), rows, p16(entry.s[block]))};
+// Of the N pixels of a block from `first` on.
+template <int N = kLanes, class R>
+GRAINGS_INLINE Distance<R, N> distance(const TileEntry<R>& entry, int block, int first = 0) {
+    const auto all = [](R x) { return splat<R, N>(x); };
+    return {load<N>(entry.lanes + first) + all(entry.r[block]), fma(all(entry.look.sy), load<N>(kRows<R> + first), all(entry.s[block]))};
 }
 
-template <class R>
-GRAINGS_INLINE P<R> uncapped_alpha(const TileEntry<R>& entry, const Distance<R>& d) {
-    return exp2(fnma(d.r, d.r, fnma(d.s, d.s, p16(entry.look.log_opacity))));
+template <class R, int N>
+GRAINGS_INLINE Vec<R, N> uncapped_alpha(const TileEntry<R>& entry, const Distance<R, N>& d) {
+    return exp2(fnma(d.r, d.r, fnma(d.s, d.s, splat<R, N>(entry.look.log_opacity))));
 }
 
 // What decides whether an entry counts in a pixel. Light so faint that no sum in R can see it counts as none: so much
@@ -190,7 +201,6 @@ template <class R, bool Compat, bool Keep, bool Depth>
 GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end, TileEntry<R>* chunk) {
     const TileBox box = tile_box(args.camera, tile);
     const Rule<R> limits = rule<R>(args.settings);
-    const P<R> rows = load<kLanes>(kRows<R>);
     alignas(64) R open[kBlocks][kLanes], light[kBlocks][kLanes], last[kBlocks][kLanes], channels[4][kBlocks][kLanes];
     uint32_t live = open_lanes(box, open);
     std::memcpy(light, open, sizeof light);
@@ -229,7 +239,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
             uint64_t list = lists[b];
             const auto first_of = [&](uint64_t entries) {
                 const TileEntry<R>& entry = chunk[__builtin_ctzll(entries)];
-                return uncapped_alpha(entry, distance(entry, b, rows));
+                return uncapped_alpha(entry, distance(entry, b));
             };
             P<R> raw = first_of(list);
             for (uint64_t rest; list; list = rest) {
@@ -258,7 +268,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
             for (; list; list &= list - 1) args.pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);
         };
         // Of what is small many a block has nothing to show. Watching for it costs less than the way back through it.
-        constexpr bool kWatch = Keep && kOne<R, kLanes>;
+        constexpr bool kWatch = Keep;
         if (kWatch && touched < kSmall * n) {
             for (int b = 0; b < kBlocks; b++)
                 if (lists[b]) walk(b, std::true_type());
