@@ -268,8 +268,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
             for (; list; list &= list - 1) args.pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);
         };
         // Of what is small many a block has nothing to show. Watching for it costs less than the way back through it.
-        constexpr bool kWatch = Keep;
-        if (kWatch && touched < kSmall * n) {
+        if (Keep && touched < kSmall * n) {
             for (int b = 0; b < kBlocks; b++)
                 if (lists[b]) walk(b, std::true_type());
             by_entry(lists, masks);
