@@ -9,7 +9,6 @@ namespace graings::GRAINGS_ISA {
 constexpr int kGroup = 8;
 using D = Vec<double, kGroup>;
 
-#if defined(__AVX512F__)
 // Where number k of eight rows of W lies among their columns, each of eight numbers, or the other way round.
 template <int W, bool ToRows>
 struct Places {
@@ -18,6 +17,8 @@ struct Places {
         for (int k = 0; k < 8 * W; k++) at[k] = ToRows ? k % W * 8 + k / W : k % 8 * W + k / 8;
     }
 };
+
+#if defined(__AVX512F__)
 // The numbers of up to two registers in another order, in the `part`-th register.
 template <int W, bool ToRows>
 GRAINGS_INLINE __m512 reordered(__m512 a, __m512 b, int part) {
@@ -37,6 +38,31 @@ GRAINGS_INLINE void transpose(__m512d (&x)[8]) {
         x[4 + odd] = _mm512_shuffle_f64x2(c, d, 0x88), x[6 + odd] = _mm512_shuffle_f64x2(c, d, 0xDD);
     }
 }
+#elif defined(__AVX2__)
+// The numbers of W registers in another order, in the `part`-th register.
+template <int W, bool ToRows>
+GRAINGS_INLINE __m256 reordered(const __m256 (&x)[W], int part) {
+    static constexpr Places<W, ToRows> places;
+    const __m256i at = _mm256_load_si256(reinterpret_cast<const __m256i*>(places.at + 8 * part)), source = _mm256_srli_epi32(at, 3);
+    __m256 found = _mm256_permutevar8x32_ps(x[0], at);  // by the lowest three bits
+    for (int k = 1; k < W; k++)
+        found = _mm256_blendv_ps(found, _mm256_permutevar8x32_ps(x[k], at), _mm256_castsi256_ps(_mm256_cmpeq_epi32(source, _mm256_set1_epi32(k))));
+    return found;
+}
+
+// Four registers of four numbers as a square: rows become columns.
+GRAINGS_INLINE void transpose(__m256d (&x)[4]) {
+    const __m256d even = _mm256_unpacklo_pd(x[0], x[1]), odd = _mm256_unpackhi_pd(x[0], x[1]);
+    const __m256d below_even = _mm256_unpacklo_pd(x[2], x[3]), below_odd = _mm256_unpackhi_pd(x[2], x[3]);
+    x[0] = _mm256_permute2f128_pd(even, below_even, 0x20), x[1] = _mm256_permute2f128_pd(odd, below_odd, 0x20);
+    x[2] = _mm256_permute2f128_pd(even, below_even, 0x31), x[3] = _mm256_permute2f128_pd(odd, below_odd, 0x31);
+}
+
+GRAINGS_INLINE __m256d low(D x) { return (__m256d)x.lo.v; }
+GRAINGS_INLINE __m256d high(D x) { return (__m256d)x.hi.v; }
+GRAINGS_INLINE D both(__m256d low, __m256d high) { return {{(Native<double>)low}, {(Native<double>)high}}; }
+// Numbers that are whole and not negative, below 2^31.
+GRAINGS_INLINE __m256i whole(D x) { return _mm256_set_m128i(_mm256_cvttpd_epi32(high(x)), _mm256_cvttpd_epi32(low(x))); }
 #endif
 
 // The columns of a row-major [N, W] array for Gaussians begin..begin+7; past the end the last one repeats.
@@ -58,6 +84,17 @@ GRAINGS_INLINE void columns_of(const R* rows, int64_t begin, int64_t count, D* c
                 const __m512 pair = W == 1 ? a : reordered<W, false>(a, b, part);
                 columns[2 * part].v = (Native<double>)_mm512_cvtps_pd(_mm512_castps512_ps256(pair));
                 if (2 * part + 1 < W) columns[2 * part + 1].v = (Native<double>)_mm512_cvtps_pd(_mm512_extractf32x8_ps(pair, 1));
+            }
+            return;
+        }
+#elif defined(__AVX2__)
+    if constexpr (sizeof(R) == 4)
+        if (begin + kGroup <= count) {
+            __m256 x[W];
+            for (int part = 0; part < W; part++) x[part] = _mm256_loadu_ps(rows + begin * W + kGroup * part);
+            for (int c = 0; c < W; c++) {
+                const __m256 column = reordered<W, false>(x, c);
+                columns[c] = both(_mm256_cvtps_pd(_mm256_castps256_ps128(column)), _mm256_cvtps_pd(_mm256_extractf128_ps(column, 1)));
             }
             return;
         }
@@ -94,6 +131,14 @@ GRAINGS_INLINE void store_columns(R* rows, int64_t begin, int64_t end, const D* 
             }
             return;
         }
+#elif defined(__AVX2__)
+    if constexpr (sizeof(R) == 4)
+        if (begin + kGroup <= end) {
+            __m256 x[W];
+            for (int c = 0; c < W; c++) x[c] = (__m256)rounded<R>(columns[c]).v;
+            for (int part = 0; part < W; part++) _mm256_storeu_ps(rows + begin * W + kGroup * part, reordered<W, true>(x, part));
+            return;
+        }
 #endif
     R lanes[W][kGroup];
     for (int c = 0; c < W; c++) store_as<R>(lanes[c], columns[c]);
@@ -114,12 +159,29 @@ GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*p
     transpose(column);
     for (int row = 0; row < 8; row++) _mm512_storeu_pd(to + row, column[row]);
 }
+#elif defined(__AVX2__)
+// Eight records from their columns: numbers of float64, and pairs of single precision that fill as much.
+GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*pairs)[2]) {
+    const auto pair = [&](int c, bool upper) {
+        const __m128 first = _mm256_cvtpd_ps(upper ? high(pairs[c][0]) : low(pairs[c][0])), second = _mm256_cvtpd_ps(upper ? high(pairs[c][1]) : low(pairs[c][1]));
+        return _mm256_castps_pd(_mm256_set_m128(_mm_unpackhi_ps(first, second), _mm_unpacklo_ps(first, second)));
+    };
+    const auto put = [&](int row, int from, __m256d a, __m256d b, __m256d c, __m256d d) {
+        __m256d x[4] = {a, b, c, d};
+        transpose(x);
+        for (int k = 0; k < 4; k++) _mm256_store_pd(reinterpret_cast<double*>(to + row + k) + from, x[k]);
+    };
+    put(0, 0, low(whole[0]), low(whole[1]), low(whole[2]), pair(0, false));
+    put(0, 4, pair(1, false), pair(2, false), pair(3, false), _mm256_setzero_pd());
+    put(4, 0, high(whole[0]), high(whole[1]), high(whole[2]), pair(0, true));
+    put(4, 4, pair(1, true), pair(2, true), pair(3, true), _mm256_setzero_pd());
+}
 #endif
 
 // Records of Gaussians begin..begin+7, as far as they come before the end.
 template <class R>
 GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, const D* whole, const D (*pairs)[2]) {
-#if defined(__AVX512F__)
+#if defined(__AVX2__)
     if constexpr (sizeof(R) == 4)
         if (begin + kGroup <= end) {
             store_records(records + begin, whole, pairs);
@@ -147,6 +209,13 @@ GRAINGS_INLINE void put_spans(Span* spans, int64_t begin, int64_t end, D tiles, 
         _mm512_storeu_ps(to, reordered<3, true>(a, b, 0)), _mm256_storeu_ps(to + 16, _mm512_castps512_ps256(reordered<3, true>(a, b, 1)));
         return;
     }
+#elif defined(__AVX2__)
+    if (begin + kGroup <= end) {
+        const auto side = [](D low, D high) { return _mm256_castsi256_ps(_mm256_or_si256(whole(low), _mm256_slli_epi32(whole(high), 16))); };
+        const __m256 columns[3] = {_mm256_castsi256_ps(whole(tiles)), side(sides[0], sides[1]), side(sides[2], sides[3])};
+        for (int part = 0; part < 3; part++) _mm256_storeu_ps(reinterpret_cast<float*>(spans + begin) + kGroup * part, reordered<3, true>(columns, part));
+        return;
+    }
 #endif
     double count[kGroup], side[4][kGroup];
     store(count, tiles);
@@ -161,6 +230,13 @@ GRAINGS_INLINE void put_bytes(uint8_t* bytes, int64_t begin, int64_t end, D numb
 #if defined(__AVX512F__)
     if (begin + kGroup <= end) {
         _mm_storeu_si64(bytes + begin, _mm256_cvtepi32_epi8(_mm512_cvttpd_epi32((__m512d)numbers.v)));
+        return;
+    }
+#elif defined(__AVX2__)
+    if (begin + kGroup <= end) {
+        const __m256i wide = whole(numbers);
+        const __m128i half = _mm_packs_epi32(_mm256_castsi256_si128(wide), _mm256_extracti128_si256(wide, 1));
+        _mm_storeu_si64(bytes + begin, _mm_packus_epi16(half, half));
         return;
     }
 #endif
@@ -180,6 +256,15 @@ GRAINGS_INLINE void add_sums(const R* of_pair, bool any, Sums& total) {
         const __m512 sums = _mm512_maskz_loadu_ps(__mmask16(-int(any)) & ((1 << kSums) - 1), of_pair);
         total.first.v += (Native<double>)_mm512_cvtps_pd(_mm512_castps512_ps256(sums));
         total.rest.v += (Native<double>)_mm512_cvtps_pd(_mm512_extractf32x8_ps(sums, 1));
+        return;
+    }
+#elif defined(__AVX2__)
+    if constexpr (sizeof(R) == 4) {
+        const int all = -int(any);
+        const __m256 first = _mm256_maskload_ps(of_pair, _mm256_set1_epi32(all));
+        const __m128 rest = _mm_maskload_ps(of_pair + kGroup, _mm_setr_epi32(all, all, 0, 0));
+        total.first = total.first + both(_mm256_cvtps_pd(_mm256_castps256_ps128(first)), _mm256_cvtps_pd(_mm256_extractf128_ps(first, 1)));
+        total.rest = total.rest + both(_mm256_cvtps_pd(rest), _mm256_setzero_pd());
         return;
     }
 #endif
@@ -205,6 +290,13 @@ GRAINGS_INLINE void columns_of_sums(const double (&rows)[kGroup][kSumStride], D 
     };
     const __m512d even = every_other(0), odd = every_other(1);
     columns[8].v = (Native<double>)_mm512_unpacklo_pd(even, odd), columns[9].v = (Native<double>)_mm512_unpackhi_pd(even, odd);
+#elif defined(__AVX2__)
+    for (int part = 0; part < kSums; part += 4) {  // of the last one two columns are not used
+        __m256d above[4], below[4];
+        for (int i = 0; i < 4; i++) above[i] = _mm256_loadu_pd(rows[i] + part), below[i] = _mm256_loadu_pd(rows[4 + i] + part);
+        transpose(above), transpose(below);
+        for (int c = 0; c < 4 && part + c < kSums; c++) columns[part + c] = both(above[c], below[c]);
+    }
 #else
     double lanes[kSums][kGroup];
     for (int i = 0; i < kGroup; i++)

@@ -99,31 +99,32 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
 template <class R>
 static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
     const ProjectArgs<R> args = given;  // a byte stored to `status` may not change these
+    // Vectors are not const here: GCC 12 keeps such as are, of two registers each, in memory.
     const Settings& s = args.settings;
     const Inputs<R>& in = args.in;
-    const Limits limit = limits(args.camera, s);
+    Limits limit = limits(args.camera, s);
     const double width = double(args.camera.width), height = double(args.camera.height);
-    const D half = d8(0.5), zero = d8(0), one = d8(1), w = d8(width), h = d8(height), faintest = d8(__builtin_log2(s.alpha_min)), slack = d8(1e-5) - d8(1e-6) * faintest;
+    D half = d8(0.5), zero = d8(0), one = d8(1), w = d8(width), h = d8(height), faintest = d8(__builtin_log2(s.alpha_min)), slack = d8(1e-5) - d8(1e-6) * faintest;
     for (int64_t group = begin; group < end; group += kGroup) {
         D opacity, color[3];
         columns_of<1>(in.opacities, group, in.count, &opacity);
         columns_of<3>(in.colors, group, in.count, color);
         // early: a long chain of its own, which fills the pauses of the other one
-        const D log_opacity = log2<R>(opacity), level = s.alpha_min > 0 ? log_opacity - faintest : d8(1e30), root = sqrt(max(level, zero));
-        const Projected p = project_group(args.camera, s, limit, in, group);
-        const D footprint = (p.x - p.x) + (p.y - p.y) + (p.slope - p.slope) + (p.v - p.v) + (p.c - p.c) + (p.a - p.a);
-        const D loose = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
-        const D broad = sqrt(p.a), tall = sqrt(p.c), narrow = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
-        const D sr = unit * narrow / p.v, sy = unit * tall * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
+        D log_opacity = log2<R>(opacity), level = s.alpha_min > 0 ? log_opacity - faintest : d8(1e30), root = sqrt(max(level, zero));
+        Projected p = project_group(args.camera, s, limit, in, group);
+        D footprint = (p.x - p.x) + (p.y - p.y) + (p.slope - p.slope) + (p.v - p.v) + (p.c - p.c) + (p.a - p.a);
+        D loose = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
+        D broad = sqrt(p.a), tall = sqrt(p.c), narrow = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
+        D sr = unit * narrow / p.v, sy = unit * tall * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
         // Where q exceeds `level` nothing is drawn. The pixel decides; what follows from it only saves work, so it is
         // widened by more than any rounding of the exponent, which is as large as `faintest` there.
-        const D widened = min(fma(level, d8(1 + 1e-5), slack), d8(1e30));
-        const D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
+        D widened = min(fma(level, d8(1 + 1e-5), slack), d8(1e30));
+        D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
         // blocks with a pixel's centre in it
         const auto block = [](D pixel) { return floor(pixel * d8(1.0 / kBlock)); };
-        const D first_x = zero - floor(zero - clamp(p.x - wide - half, zero, w)), last_x = floor(clamp(p.x + wide - half, zero - one, w - one));
-        const D first_y = zero - floor(zero - clamp(p.y - high - half, zero, h)), last_y = floor(clamp(p.y + high - half, zero - one, h - one));
-        const D exact = (s.alpha_min > 0 ? root : d8(__builtin_inf())) * radius;
+        D first_x = zero - floor(zero - clamp(p.x - wide - half, zero, w)), last_x = floor(clamp(p.x + wide - half, zero - one, w - one));
+        D first_y = zero - floor(zero - clamp(p.y - high - half, zero, h)), last_y = floor(clamp(p.y + high - half, zero - one, h - one));
+        D exact = (s.alpha_min > 0 ? root : d8(__builtin_inf())) * radius;
         D radii[2] = {exact * broad, exact * tall};
         D sides[4] = {block(first_x), block(last_x), block(first_y), block(last_y)};
         auto tiled = (first_x <= last_x) & (first_y <= last_y), inside = zero <= zero;
@@ -147,19 +148,19 @@ static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
             inside = (p.x - radii[0] <= w + half) & (zero - half <= p.x + radii[0]) & (p.y - radii[1] <= h + half) & (zero - half <= p.y + radii[1]);
 
         const auto is_zero = [&](D t) { return (zero <= t) & (t <= zero); };  // and a number
-        const D largest = max(max(p.scale[0], p.scale[1]), max(p.scale[2], abs(p.z)));
-        const auto finite = is_zero(loose) & (largest <= d8(s.far)), turned = d8(1e-24) <= p.squared, ahead = d8(s.near) < p.z;
-        const auto seen = d8(s.alpha_min) < opacity, bounded = is_zero(footprint);
-        const auto drawn = finite & turned & ahead & seen & bounded & inside;
-        const D center[2] = {select(drawn, p.x, zero), select(drawn, p.y, zero)};
+        D largest = max(max(p.scale[0], p.scale[1]), max(p.scale[2], abs(p.z)));
+        auto finite = is_zero(loose) & (largest <= d8(s.far)), turned = d8(1e-24) <= p.squared, ahead = d8(s.near) < p.z;
+        auto seen = d8(s.alpha_min) < opacity, bounded = is_zero(footprint);
+        auto drawn = finite & turned & ahead & seen & bounded & inside;
+        D center[2] = {select(drawn, p.x, zero), select(drawn, p.y, zero)};
         radii[0] = select(drawn, radii[0], zero), radii[1] = select(drawn, radii[1], zero);
         store_columns<2>(args.means2d, group, end, center), store_columns<2>(args.radii, group, end, radii);
         store_columns<1>(args.depths, group, end, &p.z);
-        const D whole[3] = {p.x, p.y, p.slope}, pairs[4][2] = {{sr, sy}, {log_opacity, color[0]}, {color[1], color[2]}, {p.z, widened}};
+        D whole[3] = {p.x, p.y, p.slope}, pairs[4][2] = {{sr, sy}, {log_opacity, color[0]}, {color[1], color[2]}, {p.z, widened}};
         put_records(args.records, group, end, whole, pairs);
         const auto tile = [](D block) { return floor(block * d8(1.0 / Span::kPerTile)); };
-        const D tiles = (tile(sides[1]) - tile(sides[0]) + one) * (tile(sides[3]) - tile(sides[2]) + one);
-        const auto on_tiles = drawn & tiled;
+        D tiles = (tile(sides[1]) - tile(sides[0]) + one) * (tile(sides[3]) - tile(sides[2]) + one);
+        auto on_tiles = drawn & tiled;
         for (D& side : sides) side = select(on_tiles, side, zero);
         put_spans(args.spans, group, end, select(on_tiles, tiles, zero), sides);
         D status = d8(kOutside);  // the first reason of all counts

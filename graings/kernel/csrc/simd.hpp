@@ -235,6 +235,11 @@ template <class R, int N> GRAINGS_INLINE Vec<R, N> rounded(Vec<double, N> a) {
 // N numbers of R, widened.
 template <int N, class R> GRAINGS_INLINE Vec<double, N> load_as(const R* p) {
     if constexpr (sizeof(R) == sizeof(double)) return load<N>(p);
+#if defined(__AVX512F__)
+    else if constexpr (kOne<double, N>) return {(Native<double>)_mm512_cvtps_pd(_mm256_loadu_ps(p))};
+#elif defined(__AVX2__)
+    else if constexpr (kOne<double, N>) return {(Native<double>)_mm256_cvtps_pd(_mm_loadu_ps(p))};
+#endif
     else if constexpr (kOne<double, N>) {
         typedef float Half __attribute__((vector_size(kBytes / 2)));
         Half narrow;
@@ -304,6 +309,8 @@ GRAINGS_VEC Vec<T, N> floor(Vec<T, N> x) {
     if constexpr (kOne<T, N>) {
 #if defined(__AVX512F__)
         return {(Native<T>)_mm512_roundscale_pd((__m512d)x.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)};
+#elif defined(__AVX2__)
+        return {(Native<T>)_mm256_floor_pd((__m256d)x.v)};
 #else
         constexpr T magic = 6755399441055744;
         const Native<T> nearest = (x.v + magic) - magic;
@@ -334,7 +341,8 @@ template <int N> GRAINGS_INLINE void split_power(Vec<double, N> x, Vec<double, N
     if constexpr (kOne<double, N>) {
         typedef NativeBits<double> I;
         const I bits = (I)x.v, above = (bits & 0xFFFFFFFFFFFFF) > 0x6A09E667F3BCC ? I{} + 1 : I{};  // of the fraction in [1, 2)
-        power.v = __builtin_convertvector((bits >> 52) - 1023 + above, Native<double>);
+        constexpr double magic = 6755399441055744;  // 1.5 * 2^52, whose lowest bits count: few CPUs convert whole numbers of 64 bits
+        power.v = (Native<double>)((bits >> 52) - 1023 + above + (I)(Native<double>{} + magic)) - magic;
         fraction.v = (Native<double>)((bits & 0xFFFFFFFFFFFFF) | ((I{} + 1023 - above) << 52));
     } else {
         split_power(x.lo, power.lo, fraction.lo);
