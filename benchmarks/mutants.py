@@ -136,15 +136,15 @@ MUTANTS = (
         "j",
         "light multiplied on the way back, not divided",
         TILE_GRADIENT,
-        "load<kLanes>(light[b]) / (p16(R(1)) - alpha)",
-        "load<kLanes>(light[b]) * (p16(R(1)) - alpha)",
+        "load<N>(of(light)) / (all_of(R(1)) - alpha)",
+        "load<N>(of(light)) * (all_of(R(1)) - alpha)",
     ),
     Mutant(
         "k",
         "gradient counts entries behind the stop",
         TILE_GRADIENT,
-        "(p16(limits.alpha_min) <= seen.raw) & (p16(entry.number) <= load<kLanes>(last[b]))",
-        "p16(limits.alpha_min) <= seen.raw",
+        "(all_of(limits.alpha_min) <= seen.raw) & (all_of(entry.number) <= load<N>(last[seen.block] + seen.first))",
+        "all_of(limits.alpha_min) <= seen.raw",
     ),
     Mutant(
         "l",
@@ -265,7 +265,7 @@ MUTANTS = (
         "cap-passed",
         "gradient passed through the cap of alpha",
         TILE_GRADIENT,
-        "select(seen.raw <= p16(limits.alpha_max), weight * gain, zero)",
+        "select(seen.raw <= all_of(limits.alpha_max), weight * gain, none)",
         "weight * gain",
     ),
     Mutant(
