@@ -58,3 +58,4 @@ static inline __m128i cvtepi32_epi8(const __m256i& a) {
 
 #define _mm256_cvtepi32_epi8 elsewhere::cvtepi32_epi8
 #define __AVX512F__ 1
+#define __AVX512BW__ 1

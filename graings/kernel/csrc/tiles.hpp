@@ -91,8 +91,9 @@ GRAINGS_INLINE void by_entry(const uint64_t (&entries)[kBlocks], uint16_t (&mask
     for (int first = 0; first < kChunk; first += kSome) {
         Some all{};
         for (int b = 0; b < kBlocks; b++) {
-            const Some listed = (Some{} + uint16_t(entries[b] >> first)) & bit;
-            all |= (Some)(listed == bit) & uint16_t(1 << b);
+            const uint16_t some = uint16_t(entries[b] >> first), block = uint16_t(1 << b);
+            const Some listed = (Some{} + some) & bit;
+            all |= (Some)(listed == bit) & block;
         }
         std::memcpy(masks + first, &all, sizeof all);
     }
