@@ -264,7 +264,7 @@ class TrainConfig(Part):
         7_500, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."
     )
     small_until: int = Field(
-        15_000,
+        0,
         ge=0,
         description="Mark of the 30 000 schedule until which training looks at smaller pictures: a half of each side, "
         "or a quarter before, and so on, as long as 200 px remain. 0: never.",
@@ -295,6 +295,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         # Many views of few Gaussians: what moves is found sooner than with few views of many.
         "iterations": 1_100,
         "batch": 4,
+        # With more Gaussians small pictures cost detail; so few are none the worse, and no seed is bad.
+        "small_until": 15_000,
         # Gradients of the first steps, which find the colour of everything, do not say where detail is missing.
         "density": {
             "statistics_from": 2_000,
@@ -311,7 +313,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "iterations": PAPER_ITERATIONS,
         "batch": 1,
-        "small_until": 0,
         "density": {"grow_every": 100, "gradient_threshold": 3e-4},
         # These fall further than those of a few thousand steps, which gain by staying higher: measured with them.
         "rates": {
@@ -361,7 +362,6 @@ def restored_training(values: Any, source: Path) -> TrainConfig:
             "average_from": PAPER_ITERATIONS,
             "time_window": 1.0,
             "batch": 1,
-            "small_until": 0,
         }
         values = before | values
         for part, earlier in (("loss", {"rigidity": 0.0, "squared": 0.0}), ("scene", SHAPE_BEFORE)):

@@ -40,7 +40,7 @@ class Growth:
 
 
 class DensityStatistics:
-    """What was observed since the last reset; float64 sums and int64 counts.
+    """What was observed of each child, and of each anchor, since it was judged last; float64 sums and int64 counts.
 
     `gradient` and `drawn` [A, k]: sum of NDC gradient norms and times drawn, per child. `opacity` and `visits`
     [A]: sum over visits of the summed positive child scores, and times the anchor was in view or too faint to be drawn.
@@ -91,6 +91,12 @@ class DensityStatistics:
         judged = self.drawn > min_observations
         self.gradient[judged] = 0
         self.drawn[judged] = 0
+
+    def forget_judged(self, visits: int) -> None:
+        """Start anew for anchors seen more than `visits` times: what one showed long ago does not say what it shows."""
+        judged = self.visits > visits
+        self.opacity[judged] = 0
+        self.visits[judged] = 0
 
     def state(self) -> dict[str, Tensor]:
         """Sums and counts by name."""

@@ -79,6 +79,7 @@ class DensityControl:
     def prune(self, scene: Scene, optimizer: Optimizer) -> list[str]:
         """Remove anchors that show nothing; returns what happened, in words."""
         keep = density.prune(scene.scaffold, self.statistics, self.config)
+        self.statistics.forget_judged(self.config.prune_visits)
         removed = int((~keep).sum())
         if removed == 0:
             return []

@@ -9,6 +9,7 @@ import torch
 from graings.config import DensityConfig, TrainConfig
 from graings.scene.scaffold import Scaffold
 from graings.training.density import DensityStatistics, grow, newborn_offsets, prune, voxel_keys
+from graings.training.density_control import DensityControl
 from graings.training.optimizer import Optimizer
 from tests.models import EYE, tiny_scene
 
@@ -131,6 +132,23 @@ def test_pruning_never_empties_the_scene() -> None:
     statistics = DensityStatistics(20, 3)
     statistics.visits.fill_(100)
     assert bool(prune(scaffold, statistics, DensityConfig()).all())
+
+
+def test_an_anchor_that_showed_much_and_fades_is_pruned_at_the_second_look() -> None:
+    scene = tiny_scene()
+    config = TrainConfig()
+    control = DensityControl(config, scene, VOXEL)
+    optimizer = Optimizer(scene, config, joint_from=0)
+    opacities = torch.full((20, 3), 0.5)
+    for faded in (False, True):
+        opacities[3] = -0.5 if faded else 0.5
+        drawn = (opacities > 0).flatten().nonzero().squeeze(-1)
+        for _ in range(config.density.prune_visits + 1):
+            control.statistics.observe(
+                drawn, torch.zeros(len(drawn), 2), torch.ones(len(drawn), dtype=torch.bool), opacities, (8, 8)
+            )
+        assert control.prune(scene, optimizer) == (["pruned 1 anchors"] if faded else [])
+    assert 3 not in scene.scaffold.uids.tolist()
 
 
 def test_rows_moments_and_statistics_stay_aligned_through_growth_and_pruning() -> None:
