@@ -183,7 +183,7 @@ def test_a_run_that_does_not_say_goes_on_as_it_began(capture: Path, tmp_path: Pa
     TrainingRun.create(capture, tmp_path / "run", _config())
     facts = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (facts["config"].pop("matrix_step"), facts["config"].pop("average_from")) == ("muon", 29_000)
-    assert (facts["config"].pop("time_window"), facts["config"].pop("small_until")) == (None, 0)
+    assert (facts["config"].pop("time_window"), facts["config"].pop("small_until")) == (None, 15_000)
     assert (facts["config"].pop("batch"), facts["config"]["loss"].pop("rigidity")) == (4, 0.02)
     assert facts["config"]["loss"].pop("squared") == 10.0
     (tmp_path / "run" / "run.json").write_text(json.dumps(facts))
