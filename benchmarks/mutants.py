@@ -58,6 +58,7 @@ class Mutant:
 
 GEOMETRY, BINNING = f"{SOURCE}/geometry.hpp", f"{SOURCE}/binning.cpp"
 TILES, TILE_GRADIENT, RANKS = (f"{SOURCE}/{name}.hpp" for name in ("tiles", "tile_gradient", "ranks"))
+FRAME = f"{SOURCE}/frame.cpp"
 SCENE = ("tests/scene",)
 
 MUTANTS = (
@@ -149,9 +150,9 @@ MUTANTS = (
     Mutant(
         "l",
         "what lies behind the last entry seen not said to be unseen",
-        TILES,
-        "for (int64_t rest = k; rest < end; rest++) args.shown[args.pairs[rest].place] = 0;",
-        ";",
+        FRAME,
+        "std::fill_n(shown.get(), 64 * words, uint8_t(0))",
+        "std::fill(shown.get() + pair_count_, shown.get() + 64 * words, uint8_t(0))",
     ),
     Mutant(
         "m", "sign of the sum of s flipped", TILE_GRADIENT, "total.es = total.es + ge_s", "total.es = total.es - ge_s"
@@ -314,8 +315,8 @@ MUTANTS = (
         "dead-block",
         "entries forgotten in all blocks where one block has stopped",
         TILES,
-        "args.pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);",
-        "args.pairs[k + __builtin_ctzll(list)].mask = 0;",
+        "pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);",
+        "pairs[k + __builtin_ctzll(list)].mask = 0;",
     ),
     Mutant(
         "not-closed",

@@ -78,7 +78,7 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
     tiles.color = out.color, tiles.alpha = out.alpha, tiles.depth = out.depth;
     const int64_t words = pair_count_ / 64 + 1;  // how many were shown before the end is asked for, too
     Buffer<uint8_t> shown(gradient ? size_t(64 * words) : 0);
-    if (gradient) tiles.shown = shown.get(), std::fill(shown.get() + pair_count_, shown.get() + 64 * words, uint8_t(0));
+    if (gradient) tiles.shown = shown.get(), std::fill_n(shown.get(), 64 * words, uint8_t(0));
     Buffer<TileEntry<R>> chunks(size_t(threads) * kChunk);
     each_tile(threads, tiles_, [&](int worker, int64_t tile, int64_t end) { run.draw_tile(tiles, tile, end, chunks.get() + worker * kChunk); });
     if (gradient) {

@@ -209,6 +209,8 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
         for (int b = 0; b < kBlocks; b++) store(last[b], p16(R(-1)));
     std::memset(channels, 0, sizeof channels);
 
+    Pair* const pairs = args.pairs;
+    uint8_t* const shown = args.shown;  // as far as the compiler knows, a byte stored there may change `args`
     int64_t k = args.begin[tile];
     const int64_t end = args.begin[tile + 1], start = k, soon_end = args.begin[next_end];
     int32_t items = 0;
@@ -219,8 +221,9 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
         uint64_t lists[kBlocks];
         int touched = 0;  // blocks, by all entries
         for (int j = 0; j < n; j++) {
-            Pair& pair = args.pairs[k + j];
-            if (k + j + kChunk < soon_end) __builtin_prefetch(&args.records[args.pairs[k + j + kChunk].id]);  // maybe the next tile's
+            Pair& pair = pairs[k + j];
+            if (k + j + kChunk < soon_end) __builtin_prefetch(&args.records[pairs[k + j + kChunk].id]);  // maybe the next tile's
+            if (Keep && shown) __builtin_prefetch(shown + pair.place, 1);
             if (pair.mask &= live) {
                 prepare(chunk[j], args.records[pair.id], double(box.left), double(box.top), k + j - start);
                 if constexpr (!Compat) pair.mask &= reached_blocks(chunk[j]);
@@ -266,28 +269,26 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
             if (any(Compat ? p16(R(0)) < going : p16(limits.transmittance_min) <= t)) return;
             live &= ~(1u << b);  // all its pixels have stopped: the gradient need not look at the rest
             items -= __builtin_popcountll(list);
-            for (; list; list &= list - 1) args.pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);
+            for (; list; list &= list - 1) pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);
         };
         // Of what is small many a block has nothing to show. Watching for it costs less than the way back through it.
         if (Keep && touched < kSmall * n) {
             for (int b = 0; b < kBlocks; b++)
                 if (lists[b]) walk(b, std::true_type());
             by_entry(lists, masks);
-            for (int j = 0; j < n; j++) args.pairs[k + j].mask = masks[j];
+            for (int j = 0; j < n; j++) pairs[k + j].mask = masks[j];
         } else
             for (int b = 0; b < kBlocks; b++)
                 if (lists[b]) walk(b, std::false_type());
-        if (Keep && args.shown)  // what the gradient has to look at moves together
+        if (Keep && shown)  // what the gradient has to look at moves together
             for (int j = 0; j < n; j++) {
-                const Pair& pair = args.pairs[k + j];
-                args.shown[pair.place] = pair.mask != 0;
-                args.pairs[kept] = {uint32_t(k + j - start), pair.id, pair.place, pair.mask};
+                const Pair pair = pairs[k + j];
+                shown[pair.place] = pair.mask != 0;
+                pairs[kept] = {uint32_t(k + j - start), pair.id, pair.place, pair.mask};
                 kept += pair.mask != 0;
             }
         k += n;
     }
-    if (Keep && args.shown)
-        for (int64_t rest = k; rest < end; rest++) args.shown[args.pairs[rest].place] = 0;
     args.kept[tile] = int32_t(kept - start);
     args.items[tile] = items;
     if (Keep && args.light) {

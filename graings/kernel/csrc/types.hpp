@@ -110,7 +110,7 @@ struct TileArgs {
     Pair* pairs;          // for the gradient, those shown move to the front, with their number in the tile as key
     int32_t* kept;        // entries per tile that were shown: by a block whose pixels had not all stopped
     int32_t* items;       // (entry, block) pairs per tile
-    uint8_t* shown;       // [place] for the gradient, or null: whether a block has shown the pair
+    uint8_t* shown;       // [place] for the gradient, or null: whether a block has shown the pair; 0 before
     R *light, *last;      // [tile, block, lane] for the gradient, or null: what passes all entries, and the number of
                           // the last entry of the tile that counted
     R *color, *alpha, *depth;  // depth may be null
