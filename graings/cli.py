@@ -163,12 +163,20 @@ def evaluate(
     run: Run,
     split: Annotated[Literal["val", "test"], typer.Option(help="Held-out views to measure.")] = "val",
     capture: Annotated[Path | None, typer.Option(help="Where the capture lies now, if it moved.")] = None,
+    background: Annotated[
+        str | None, typer.Option(help="white, black, #rrggbb or r,g,b instead of training's; only told, not written.")
+    ] = None,
     threads: Threads = None,
 ) -> None:
     """Measure a trained model on held-out views and add the numbers to its metrics.json."""
     use_threads(threads)
-    say(metrics_line(split, evaluate_run(run, split, capture).to_json()))
-    say(f"Written to {run / 'metrics.json'}.")
+    try:
+        rgb = background_rgb(background) if background is not None else None
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--background") from error
+    say(metrics_line(split, evaluate_run(run, split, capture, rgb).to_json()))
+    if rgb is None:
+        say(f"Written to {run / 'metrics.json'}.")
 
 
 @app.command()

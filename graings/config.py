@@ -127,7 +127,7 @@ class InitConfig(Part):
 
 
 class LossConfig(Part):
-    """Weights of Eq. 14-18 and of rigidity; the l_* switches are for ablations. Owner: `graings.training.losses`."""
+    """Weights of Eq. 14-18, alpha and rigidity; the l_* switches are for ablations. Owner: `graings.training.losses`."""
 
     ssim: float = Field(0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss.")
     squared: float = Field(
@@ -135,6 +135,12 @@ class LossConfig(Part):
         ge=0,
         description="Weight of the mean squared error, which joins the photometric loss after the last growth. Not in "
         "the paper: absolute differences let a few large errors stand.",
+    )
+    alpha: float = Field(
+        0.03,
+        ge=0,
+        description="Weight of the difference between the opacity drawn and the pictures' alpha, where they have one. Not "
+        "in the paper: what has the background's colour may else be a hole, and veils of it hang where there is nothing.",
     )
     temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
     deformation: float = Field(0.001, ge=0, description="lambda_2, magnitude of the deformation.")
@@ -364,7 +370,7 @@ def restored_training(values: Any, source: Path) -> TrainConfig:
             "batch": 1,
         }
         values = before | values
-        for part, earlier in (("loss", {"rigidity": 0.0, "squared": 0.0}), ("scene", SHAPE_BEFORE)):
+        for part, earlier in (("loss", {"rigidity": 0.0, "squared": 0.0, "alpha": 0.0}), ("scene", SHAPE_BEFORE)):
             if isinstance(values.get(part), dict):
                 values[part] = earlier | values[part]
     return restored(TrainConfig, values, source)

@@ -61,11 +61,14 @@ def frames_per_second(scene: Scene, frames: Sequence[Frame], background: Sequenc
     return 1.0 / max(statistics.median(seconds[1:]), 1e-9)
 
 
-def evaluate_run(run: Path, split: Split, capture: Path | None = None) -> SplitMetrics:
+def evaluate_run(
+    run: Path, split: Split, capture: Path | None = None, background: Sequence[float] | None = None
+) -> SplitMetrics:
     """Evaluate the newest model of a run on one split and write the result into its `metrics.json`.
 
-    The capture is found where it was at training time unless given. Raises `CheckpointError` when the run has
-    no model or the capture is not the one it was trained on.
+    The capture is found where it was at training time unless given. On another `background` [3] than training's,
+    which says whether opaque things are so and empty space is empty, nothing is written. Raises `CheckpointError` when
+    the run has no model or the capture is not the one it was trained on.
     """
     model = open_model(run)
     record = read_record(run)
@@ -75,8 +78,11 @@ def evaluate_run(run: Path, split: Split, capture: Path | None = None) -> SplitM
             f"{data.root}: not the capture this run was trained on. Give the original with --capture."
         )
     frames = data.split(split)
-    images = ImageStore(model.background, model.config.capture.cache_mb)
-    metrics = evaluate(model.scene, frames, images, model.background, lpips=Lpips.find())
+    behind = model.background if background is None else background
+    images = ImageStore(behind, model.config.capture.cache_mb)
+    metrics = evaluate(model.scene, frames, images, behind, lpips=Lpips.find())
+    if background is not None:
+        return metrics
     document = read_metrics(run / "metrics.json")
     if not isinstance(document.get("splits"), dict):
         raise CheckpointError(f"{run / 'metrics.json'}: has no `splits`. Finish the training run again (--resume).")

@@ -13,6 +13,7 @@ from graings.capture.capture import Capture
 from graings.config import TrainConfig
 
 SCHEMA = "graings.plan/1"
+NO_ALPHA = "the images have no alpha channel"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,8 @@ class Plan:
             loss["l_temp"] = False
         if self.drops("rigidity"):
             loss["l_rigid"] = False
+        if self.drops("alpha_loss"):
+            loss["alpha"] = 0.0
         return config.model_copy(
             update={"scene": config.scene.model_copy(update=scene), "loss": config.loss.model_copy(update=loss)}
         )
@@ -89,6 +92,11 @@ def make_plan(capture: Capture, config: TrainConfig) -> Plan:
     else:
         reason = "nothing moves" if static else "one view a step" if alone else "neighbours move together"
         decide("rigidity", static or alone, reason, "exact")
+    if config.loss.alpha == 0:
+        decisions.append(Decision("alpha_loss", "drop", "user", "loss.alpha is 0"))
+    else:
+        masks = "the masks say what is solid" if capture.has_alpha else NO_ALPHA
+        decide("alpha_loss", not capture.has_alpha, masks, "exact")
     cloud = capture.points is not None
     decide("random_points", cloud, "the capture brings its own points" if cloud else "no point cloud in the capture")
     decide(
@@ -96,7 +104,7 @@ def make_plan(capture: Capture, config: TrainConfig) -> Plan:
         cloud or not capture.has_alpha,
         "no masks needed"
         if cloud
-        else ("masks say where there is nothing" if capture.has_alpha else "the images have no alpha channel"),
+        else ("masks say where there is nothing" if capture.has_alpha else NO_ALPHA),
         "exact",
     )
     return Plan(tuple(decisions))

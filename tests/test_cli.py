@@ -97,6 +97,20 @@ def test_evaluating_test_views_adds_them_to_the_numbers(run: Path, capsys: pytes
     assert f"PSNR {document['splits']['test']['psnr']:.2f} dB" in capsys.readouterr().out
 
 
+def test_evaluating_on_another_background_leaves_the_numbers_as_they_are(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (run / "metrics.json").read_bytes()
+    said = []
+    for background in ("white", "black"):
+        assert graings("evaluate", run, "--background", background) == 0
+        said.append(capsys.readouterr().out)
+    assert (run / "metrics.json").read_bytes() == before
+    assert f"PSNR {json.loads(before)['splits']['val']['psnr']:.2f} dB" in said[0]
+    assert "PSNR" in said[1]
+    assert said[1] != said[0]
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".exr"])
 def test_the_file_name_chooses_the_format(run: Path, tmp_path: Path, suffix: str) -> None:
     file = tmp_path / f"view{suffix}"
@@ -228,6 +242,7 @@ def test_a_place_that_nobody_may_write_to_is_named_with_a_remedy(run: Path, caps
         (["render", "RUN", "-o", "view.png"], 65, "no checkpoint"),
         (["evaluate", "RUN"], 65, "no checkpoint"),
         (["evaluate", "RUN", "--split", "train"], 2, "split"),
+        (["evaluate", "RUN", "--background", "pink"], 2, "background"),
         (["juggle"], 2, "juggle"),
     ],
 )

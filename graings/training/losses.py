@@ -1,5 +1,5 @@
-"""The loss terms on the model itself as pure functions, each with its equation; `graings.raster.photometric` is that
-on the image.
+"""The loss terms on the model itself as pure functions, each with its equation, and that on a picture's alpha;
+`graings.raster.photometric` is that on its colours.
 
 Reductions are means over Gaussians (decision 10): a sum would change the balance with every
 growth. Knows nothing of schedules or optimisers.
@@ -13,12 +13,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
 from graings.scene.deformation import Deformation
 
 # A strain well above this costs in proportion, so that joints may bend for the price of what they bend; one well below,
 # with its square, so that what hardly moves is left alone.
 SLIGHT_STRAIN: Final = 0.01
+
+LEVEL: Final = 1 / 255  # of a picture file; a smaller difference in alpha may be the file's rounding
 
 
 def temporal(
@@ -39,6 +42,15 @@ def deformation(offsets: Deformation) -> Tensor:
 def residual(change: Float[Tensor, "gaussian 4"]) -> Tensor:
     """Mean squared appearance residual (Delta c, Delta o), Eq. 18."""
     return mean_square(change)
+
+
+def alpha(drawn: Float[Tensor, "height width"], seen: Float[Tensor, "height width"]) -> Tensor:
+    """Mean absolute difference between the opacity drawn and a picture's alpha, smooth where it is below a level.
+
+    Not in the paper: on one background, a hole and a thing of the background's colour look the same, and so do empty
+    space and a veil of that colour.
+    """
+    return functional.smooth_l1_loss(drawn, seen, beta=LEVEL)
 
 
 def rigidity(lengths: Float[Tensor, "instant pair"], weights: Float[Tensor, " pair"]) -> Tensor:

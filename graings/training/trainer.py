@@ -22,8 +22,10 @@ from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.errors import DivergedError
 from graings.raster.photometric import photometric
+from graings.raster.result import RenderResult
 from graings.render import draw, low_pass
 from graings.scene.scene import Composition, Scene
+from graings.training import losses
 from graings.training.average import Average
 from graings.training.collapse import SCORE, Collapse, mend
 from graings.training.density_control import DensityControl
@@ -152,6 +154,7 @@ class Trainer:
             ]
         )
         loss = self.regularisers(compositions, [frame.time for frame in frames]) + differences.mean()
+        loss = loss + self._alpha_term(frames, results)
         # With nothing drawn and no regulariser there is nothing to differentiate; the guard still sees the loss.
         if loss.requires_grad:
             loss.backward()
@@ -201,6 +204,17 @@ class Trainer:
             cpu_s=time.process_time() - computed,
             events=tuple(events),
         )
+
+    def _alpha_term(self, frames: Sequence[Frame], results: Sequence[RenderResult]) -> Tensor:
+        """Of the views that have an alpha channel, with this run's weight; a view without one counts as right."""
+        total, weight = torch.zeros(()), self.config.loss.alpha
+        if weight == 0:
+            return total
+        for frame, result in zip(frames, results, strict=True):
+            seen = self.images.alpha(frame)
+            if seen is not None:
+                total = total + losses.alpha(result.alpha, torch.from_numpy(seen))
+        return total * (weight / len(frames))
 
     def _squared_weight(self) -> float:
         """Of the mean squared error in this step: none while anchors grow, or they would grow wherever it is large."""

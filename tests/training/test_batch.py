@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from graings.capture.capture import Frame
 from graings.raster.photometric import photometric
@@ -73,7 +74,10 @@ def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.Monkey
     for frame in chosen:
         drawn = draw(before.compose(frame.camera.center, frame.time), frame.camera, trainer.background)
         target, weights = torch.from_numpy(trainer.images.rgb(frame)), trainer.config.loss
-        losses.append(photometric(drawn.color, target, weights.ssim, weights.squared))
+        alpha = trainer.images.alpha(frame)
+        assert alpha is not None
+        opaque = functional.smooth_l1_loss(drawn.alpha, torch.from_numpy(alpha), beta=1 / 255)
+        losses.append(photometric(drawn.color, target, weights.ssim, weights.squared) + weights.alpha * opaque)
     assert len(losses) > 1
     mean = torch.stack(losses).mean()
     mean.backward()

@@ -31,6 +31,17 @@ def test_residual_is_the_mean_over_gaussians_too() -> None:
     assert float(losses.residual(RAW[:, :4])) == pytest.approx(float((RAW[:, :4] ** 2).sum()) / 7, rel=1e-14)
 
 
+def test_alpha_is_the_mean_of_absolute_differences_but_for_those_below_a_level() -> None:
+    seen = torch.tensor([[0.0, 1.0], [1.0, 0.5]], dtype=torch.float64)
+    drawn = (seen + torch.tensor([[0.4, -1.0], [0.0, 0.5 / 255]], dtype=torch.float64)).requires_grad_()
+    value = losses.alpha(drawn, seen)
+    half = 0.5 / 255
+    assert float(value.detach()) == pytest.approx((0.4 - half + 1.0 - half + half / 4) / 4, rel=1e-14)
+    value.backward()
+    assert drawn.grad is not None
+    assert drawn.grad.tolist() == [[0.25, -0.25], [0.0, pytest.approx(0.125, rel=1e-12)]]
+
+
 @pytest.mark.parametrize("rows", [RAW, RAW[:, 2:5], RAW[:1], torch.zeros(3, 4, dtype=torch.float64)])
 def test_the_way_back_of_a_mean_square(rows: torch.Tensor) -> None:
     leaf = rows.clone().requires_grad_()
