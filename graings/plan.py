@@ -102,9 +102,7 @@ def make_plan(capture: Capture, config: TrainConfig) -> Plan:
     decide(
         "alpha_carving",
         cloud or not capture.has_alpha,
-        "no masks needed"
-        if cloud
-        else ("masks say where there is nothing" if capture.has_alpha else NO_ALPHA),
+        "no masks needed" if cloud else ("masks say where there is nothing" if capture.has_alpha else NO_ALPHA),
         "exact",
     )
     return Plan(tuple(decisions))
