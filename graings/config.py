@@ -127,7 +127,7 @@ class InitConfig(Part):
 
 
 class LossConfig(Part):
-    """Weights of Eq. 14-18, alpha and rigidity; the l_* switches are for ablations. Owner: `graings.training.losses`."""
+    """Weights of Eq. 14-18, alpha and rigidity; l_* switches are for ablations. Owner: `graings.training.losses`."""
 
     ssim: float = Field(0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss.")
     squared: float = Field(
@@ -139,8 +139,8 @@ class LossConfig(Part):
     alpha: float = Field(
         0.03,
         ge=0,
-        description="Weight of the difference between the opacity drawn and the pictures' alpha, where they have one. Not "
-        "in the paper: what has the background's colour may else be a hole, and veils of it hang where there is nothing.",
+        description="Weight of the difference between the opacity drawn and the pictures' alpha, where they have one. "
+        "Not in the paper: what has the background's colour may else be a hole, and empty space be veiled by it.",
     )
     temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
     deformation: float = Field(0.001, ge=0, description="lambda_2, magnitude of the deformation.")
