@@ -177,6 +177,8 @@ def evaluate(
     say(metrics_line(split, evaluate_run(run, split, capture, rgb).to_json()))
     if rgb is None:
         say(f"Written to {run / 'metrics.json'}.")
+    else:
+        say(f"On {background}; metrics.json keeps the numbers on the background of training.")
 
 
 @app.command()

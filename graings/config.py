@@ -308,7 +308,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "statistics_from": 2_000,
             "gradient_threshold": 3e-4,
             "min_observations": 20,
-            "max_anchors": 1_600,  # a floor of the background's colour took most of 1 200
+            "max_anchors": 1_600,  # a floor of the background's colour could take all of 1 200
         },
         "evaluation": {"checkpoint_every": 250},  # a look at what there is by then, half a minute from the start
         "rates": {"offsets": (0.03, 1e-3), "matrices": (8e-3, 2e-4)},

@@ -105,6 +105,7 @@ def test_evaluating_on_another_background_leaves_the_numbers_as_they_are(
     for background in ("white", "black"):
         assert graings("evaluate", run, "--background", background) == 0
         said.append(capsys.readouterr().out)
+        assert f"On {background};" in said[-1]
     assert (run / "metrics.json").read_bytes() == before
     assert f"PSNR {json.loads(before)['splits']['val']['psnr']:.2f} dB" in said[0]
     assert "PSNR" in said[1]

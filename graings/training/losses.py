@@ -1,7 +1,7 @@
 """The loss terms on the model itself as pure functions, each with its equation, and that on a picture's alpha;
 `graings.raster.photometric` is that on its colours.
 
-Reductions are means over Gaussians (decision 10): a sum would change the balance with every
+Reductions are means over Gaussians (decision 10), or over pixels: a sum would change the balance with every
 growth. Knows nothing of schedules or optimisers.
 """
 
@@ -45,7 +45,9 @@ def residual(change: Float[Tensor, "gaussian 4"]) -> Tensor:
 
 
 def alpha(drawn: Float[Tensor, "height width"], seen: Float[Tensor, "height width"]) -> Tensor:
-    """Mean absolute difference between the opacity drawn and a picture's alpha, smooth where it is below a level.
+    """Mean over pixels of the absolute difference between the opacity drawn and a picture's alpha, both in [0, 1].
+
+    Below a `LEVEL` its square, so that the gradient fades there (Girshick's smooth L1, "Fast R-CNN", Eq. 3).
 
     Not in the paper: on one background, a hole and a thing of the background's colour look the same, and so do empty
     space and a veil of that colour.
