@@ -47,8 +47,10 @@ class CaptureConfig(Part):
     max_side: int | None = Field(
         400, ge=16, le=16384, description="Longest image side in px; null keeps the files' size."
     )
-    background: Literal["white", "black"] | tuple[Channel, Channel, Channel] = Field(
-        "white", description="Colour behind transparent pixels: white, black or [r, g, b] in [0, 1]."
+    background: Literal["auto", "white", "black"] | tuple[Channel, Channel, Channel] = Field(
+        "auto",
+        description="Colour behind transparent pixels, and what needs no Gaussians where it is seen: white, black or "
+        "[r, g, b] in [0, 1]. auto: the colour around pictures without alpha if it is one, else white.",
     )
     times_from_names: bool = Field(False, description="COLMAP: take times from the number in the file name.")
     test_every: int = Field(
@@ -57,8 +59,8 @@ class CaptureConfig(Part):
     cache_mb: int = Field(1024, ge=16, description="Memory for decoded images in MB.")
 
     def background_rgb(self) -> tuple[float, float, float]:
-        """The background as RGB in [0, 1]."""
-        named = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+        """The background as RGB in [0, 1]; white while it is left to the pictures."""
+        named = {"auto": (1.0, 1.0, 1.0), "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
         return named[self.background] if isinstance(self.background, str) else self.background
 
 

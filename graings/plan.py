@@ -99,10 +99,6 @@ def make_plan(capture: Capture, config: TrainConfig) -> Plan:
         decide("alpha_loss", not capture.has_alpha, masks, "exact")
     cloud = capture.points is not None
     decide("random_points", cloud, "the capture brings its own points" if cloud else "no point cloud in the capture")
-    decide(
-        "alpha_carving",
-        cloud or not capture.has_alpha,
-        "no masks needed" if cloud else ("masks say where there is nothing" if capture.has_alpha else NO_ALPHA),
-        "exact",
-    )
+    where = "masks say where there is nothing" if capture.has_alpha else "nothing is where the background is seen"
+    decide("carving", cloud, "no random points" if cloud else where, "exact")
     return Plan(tuple(decisions))

@@ -53,16 +53,13 @@ class Masked:
 
 
 def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> list[Masked]:
-    """What each of `frames` shows: where it is opaque and not of the background's colour; all of it without alpha."""
+    """What each of `frames` shows: where it is not of the background's colour, and opaque if it has alpha."""
     found = []
     for frame in frames:
         alpha = images.alpha(frame)
-        if alpha is None:  # what lies behind is in the picture, whatever its colour
-            mask = opaque = np.ones((frame.camera.height, frame.camera.width), np.bool_)
-        else:
-            opaque = alpha > 0.5
-            mask = opaque & (np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > CONTRAST)
-        found.append(Masked(frame, mask, bool(opaque.any())))
+        differs = np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > CONTRAST
+        opaque = np.ones_like(differs) if alpha is None else alpha > 0.5
+        found.append(Masked(frame, opaque & differs, bool(opaque.any())))
     return found
 
 

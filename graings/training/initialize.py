@@ -106,7 +106,7 @@ def first_points(
         return points, window
     half = content_half_size(capture)
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
-    if not capture.has_alpha or config.init.carve_vote == 0:
+    if config.init.carve_vote == 0:
         return cube, window
     order = torch.randperm(len(capture.train), generator=generator).tolist()
     return _carved(cube, order, capture, images, config) or (cube, window)

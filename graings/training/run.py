@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from graings.capture.backdrop import with_background
 from graings.capture.capture import SPLITS, Capture, Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
@@ -80,8 +81,9 @@ class TrainingRun:
         clock = Clock()
         started = time.perf_counter()
         data = load_capture(capture, config.capture)
+        settled = config.model_copy(update={"capture": with_background(config.capture, data)})
         clock.add("load", time.perf_counter() - started)
-        run = cls(folder, data, config, None, clock)
+        run = cls(folder, data, settled, None, clock)
         folder.mkdir(parents=True, exist_ok=True)
         run._journal.write_run()
         return run

@@ -234,6 +234,9 @@ class Trainer:
         if self.iteration > 1:
             return []
         events = []
+        if not self.capture.has_alpha and self.config.capture.background not in ("auto", "white"):
+            seen = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.background)
+            events.append(f"background: {seen}; where pictures show it there is nothing")
         if (share := self.window.share(1)) < 1:
             events.append(f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens")
         if (times := self.pyramid.at(1).times) > 1:

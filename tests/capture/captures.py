@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from graings.camera import Camera
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.config import CaptureConfig
 
 FOV = 0.7
 
@@ -34,6 +37,14 @@ def write_image(path: Path, image: NDArray[Any], stored: str | None = None) -> P
     assert output.write_image(np.ascontiguousarray(image)), output.geterror()
     assert output.close()
     return path
+
+
+def without_alpha(capture: Path, colour: Sequence[float] = (1.0, 1.0, 1.0)) -> Path:
+    """Lay every image of `capture` on `colour`, as files of three channels; returns `capture`."""
+    images = ImageStore(colour)
+    for _, frame in load_capture(capture, CaptureConfig(max_side=None)):
+        write_image(frame.image_path, np.rint(images.rgb(frame) * 255).astype(np.uint8))
+    return capture
 
 
 def orbit(index: int, count: int, size: tuple[int, int] = (12, 12), radius: float = 4.0) -> Camera:

@@ -10,7 +10,6 @@ from statistics import mean
 import numpy as np
 import pytest
 
-from graings.capture.image_file import decode
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import Array, Body, SyntheticScene, write_synthetic
@@ -18,7 +17,7 @@ from graings.config import TrainConfig, make_config
 from graings.training.carving import LEAST_COVERED, carve, coverage, masked
 from graings.training.initialize import first_points
 from graings.training.streams import Streams
-from tests.capture.captures import write_image
+from tests.capture.captures import without_alpha, write_image
 from tests.training.micro import GROWING, micro_trainer, quality, said, steps
 
 WHITE = (1.0, 1.0, 1.0)
@@ -117,13 +116,29 @@ def test_what_looks_like_the_background_has_no_points(flight: Path) -> None:
     assert masked(data.train[:1], ImageStore(WHITE), own)[0].mask.sum() < red[0].mask.sum()
 
 
-def test_a_picture_without_alpha_shows_something_everywhere(tmp_path: Path) -> None:
-    capture = write_synthetic(tmp_path / "c", seed=1, frames=2, size=20)
-    pixels = decode(capture / "train/r_000.png", "r_000")
-    write_image(capture / "train/r_000.png", np.full((*pixels.shape[:2], 3), 255, np.uint8))  # the background's colour
-    first, second = masked(load_capture(capture).train, ImageStore(WHITE), WHITE)
-    assert first.mask.all()
-    assert 0 < second.mask.sum() < second.mask.size
+def test_pictures_without_alpha_show_what_is_not_of_the_background(flight: Path) -> None:
+    transparent = load_capture(flight).train[:4]
+    ours = masked(transparent, ImageStore(WHITE), WHITE)
+    without_alpha(flight)
+    flat = load_capture(flight).train[:4]
+    for one, other in zip(ours, masked(flat, ImageStore(WHITE), WHITE), strict=True):
+        assert (one.mask & ~other.mask).sum() == 0  # a rim that is half there counts too
+        assert one.mask.sum() <= other.mask.sum() < 2 * one.mask.sum() < one.mask.size / 5
+    assert all(view.mask.all() and view.opaque for view in masked(flat, ImageStore(WHITE), (0.0, 0.0, 1.0)))
+
+
+def test_without_alpha_a_clip_begins_with_as_few_points_and_the_same_part_of_it(flight: Path) -> None:
+    count, window = _found(flight, make_config("draft"))
+    without_alpha(flight)
+    flat, same = _found(flight, make_config("draft"))
+    assert same == window
+    assert count <= flat < 1.5 * count
+
+
+def test_pictures_of_the_background_alone_leave_all_points(flight: Path) -> None:
+    for frame in load_capture(flight).train:
+        write_image(frame.image_path, np.full((40, 40, 3), 255, np.uint8))
+    assert _found(flight, make_config("draft")) == (60_000, 1.0)
 
 
 def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:

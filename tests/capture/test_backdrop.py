@@ -1,0 +1,89 @@
+"""The one colour around what pictures without alpha show."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graings.capture.backdrop import backdrop, with_background
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.capture.synthetic import write_synthetic
+from graings.config import CaptureConfig
+from graings.training.run import TrainingRun
+from tests.capture.captures import pixels, without_alpha, write_dnerf, write_image
+from tests.training.micro import micro_config
+
+AUTO = CaptureConfig()
+GREY = (0.2, 0.4, 0.6)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """A ball or two on nothing, in transparent pictures."""
+    return write_synthetic(tmp_path / "c", seed=1, frames=6, size=24)
+
+
+def _background(folder: Path, config: CaptureConfig = AUTO) -> object:
+    return with_background(config, load_capture(folder, config)).background
+
+
+@pytest.mark.parametrize("colour", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), GREY])
+def test_it_is_what_surrounds_the_pictures(capture: Path, colour: tuple[float, float, float]) -> None:
+    assert _background(without_alpha(capture, colour)) == colour
+
+
+def test_noise_of_compression_does_not_hide_it(capture: Path) -> None:
+    without_alpha(capture, GREY)
+    noise = np.random.default_rng(0)
+    for frame in load_capture(capture).train:
+        seen = 255 * ImageStore((1.0, 1.0, 1.0)).rgb(frame) + noise.integers(-4, 5, (24, 24, 3))
+        write_image(frame.image_path, np.rint(seen).clip(0, 255).astype(np.uint8))
+    assert np.allclose(_background(capture), GREY, atol=1.5 / 255)  # type: ignore[arg-type]
+
+
+def test_a_picture_of_all_sorts_has_none(tmp_path: Path) -> None:
+    folder = write_dnerf(tmp_path / "c")
+    for index in range(4):
+        write_image(folder / f"train/r_{index:03d}.png", pixels(12, 12, 3, seed=index))
+    assert backdrop(load_capture(folder).train, ImageStore((1.0, 1.0, 1.0))) is None
+    assert _background(folder) == "white"
+
+
+def test_pictures_of_different_colours_have_none(capture: Path) -> None:
+    without_alpha(capture, GREY)
+    first = load_capture(capture).train[0].image_path
+    write_image(first, np.zeros((24, 24, 3), np.uint8))
+    assert _background(capture) == "white"
+
+
+def test_a_thing_that_reaches_over_an_edge_does_not_hide_it(capture: Path) -> None:
+    without_alpha(capture, GREY)
+    frame = load_capture(capture).train[0]
+    seen = ImageStore((1.0, 1.0, 1.0)).rgb(frame)
+    seen[:, :4] = 0
+    write_image(frame.image_path, np.rint(seen * 255).astype(np.uint8))
+    assert np.allclose(_background(capture), GREY, atol=1e-6)  # type: ignore[arg-type]
+
+
+def test_what_the_user_says_stands_and_alpha_means_white(capture: Path) -> None:
+    assert _background(capture) == "white"
+    black = CaptureConfig(background="black")
+    assert _background(capture, black) == "black"
+    without_alpha(capture, GREY)
+    assert _background(capture, black) == "black"
+
+
+def test_a_run_says_and_keeps_it(capture: Path, tmp_path: Path) -> None:
+    without_alpha(capture, (0.0, 0.0, 0.0))
+    config = micro_config(**{"iterations": 2})
+    run = TrainingRun.create(capture, tmp_path / "run", config)
+    first = next(iter(run))
+    assert "background: #000000; where pictures show it there is nothing" in first.events
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["config"]["capture"]["background"] == [0.0, 0.0, 0.0]
+    run.save()
+    assert TrainingRun.resume(tmp_path / "run").config.capture == run.config.capture
