@@ -120,7 +120,9 @@ class InitConfig(Part):
 
     points: int = Field(60_000, ge=16, le=2_000_000, description="Random points where the capture has no cloud.")
     carve_vote: float = Field(0.6, ge=0, le=1, description="Share of views whose mask a random point must hit to stay.")
-    max_points: int = Field(60_000, ge=16, description="At most this many points of a given cloud are used.")
+    max_points: int = Field(
+        20_000, ge=16, description="At most this many points become first anchors: of a given cloud, or carved ones."
+    )
     voxel_size: float | None = Field(
         None, ge=1e-9, description="Finest anchor cell, normalised; null: 0.7 px of the finer training views."
     )
@@ -305,6 +307,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "batch": 4,
         # With more Gaussians small pictures cost detail; so few are none the worse, and no seed is bad.
         "small_until": 15_000,
+        "init": {"max_points": 6_000},
         # Gradients of the first steps, which find the colour of everything, do not say where detail is missing.
         "density": {
             "statistics_from": 2_000,

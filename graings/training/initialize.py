@@ -99,17 +99,21 @@ def first_points(
     generator = streams["init.points"]
     window = config.time_window or 1.0
     if capture.points is not None:
-        points = capture.points.positions
-        if len(points) > config.init.max_points:
-            chosen = torch.randperm(len(points), generator=generator)[: config.init.max_points]
-            points = points[np.sort(chosen.numpy())]
-        return points, window
+        return _thinned(capture.points.positions, config.init.max_points, generator), window
     half = content_half_size(capture)
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
-    if config.init.carve_vote == 0:
-        return cube, window
-    order = torch.randperm(len(capture.train), generator=generator).tolist()
-    return _carved(cube, order, capture, images, config) or (cube, window)
+    found = cube
+    if config.init.carve_vote > 0:
+        order = torch.randperm(len(capture.train), generator=generator).tolist()
+        found, window = _carved(cube, order, capture, images, config) or (cube, window)
+    return _thinned(found, config.init.max_points, generator), window
+
+
+def _thinned(points: NDArray[np.float64], most: int, generator: torch.Generator) -> NDArray[np.float64]:
+    """At most `most` of `points` [M, 3], in their order."""
+    if len(points) <= most:
+        return points
+    return points[np.sort(torch.randperm(len(points), generator=generator)[:most].numpy())]
 
 
 def _carved(

@@ -10,6 +10,7 @@ from statistics import mean
 import numpy as np
 import pytest
 
+from graings.capture.capture import PointCloud
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import Array, Body, SyntheticScene, write_synthetic
@@ -52,6 +53,11 @@ def _ball(home: Array, swing: Array, radius: float) -> Body:
     )
 
 
+def _draft(**options: object) -> TrainConfig:
+    """A draft that begins with every point that the images allow."""
+    return make_config("draft", {"init.max_points": 60_000, **options})
+
+
 def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
     data = load_capture(capture, config.capture)
     points, window = first_points(data, ImageStore(WHITE), config, Streams(0))
@@ -59,16 +65,30 @@ def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
 
 
 def test_a_clip_in_which_nothing_stays_in_place_begins_with_a_part_of_it(flight: Path) -> None:
-    count, window = _found(flight, make_config("draft"))
+    count, window = _found(flight, _draft())
     assert 0.1 <= window < 1
     assert 100 <= count < 6_000  # of 60 000
-    assert _found(flight, make_config("draft", {"time_window": 1.0})) == (60_000, 1.0)
+    assert _found(flight, _draft(time_window=1.0)) == (60_000, 1.0)
+
+
+def test_no_more_points_are_first_anchors_than_may_be(flight: Path) -> None:
+    every, _ = _found(flight, _draft())
+    assert _found(flight, _draft(**{"init.max_points": 50}))[0] == 50 < every
+    data = load_capture(flight)
+    cloud = replace(data, points=PointCloud(_grid(), np.zeros_like(_grid(), np.float32)))
+    for capture in (data, cloud):
+        points, few = (
+            first_points(capture, ImageStore(WHITE), _draft(**{"init.max_points": most}), Streams(0))[0]
+            for most in (60_000, 50)
+        )
+        assert len(few) == 50
+        assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in points.tolist()}
 
 
 def test_a_clip_in_which_things_stay_in_place_begins_as_a_whole(tmp_path: Path) -> None:
     capture = write_synthetic(tmp_path / "c", seed=1, frames=24, size=40)
     for options in ({}, {"time_window": 1.0}):
-        count, window = _found(capture, make_config("draft", options))
+        count, window = _found(capture, _draft(**options))
         assert (count < 30_000, window) == (True, 1.0)
 
 
@@ -100,7 +120,7 @@ def test_a_clip_with_nothing_in_sight_at_its_middle_is_not_taken_for_empty(fligh
     for frame in load_capture(flight).train:
         if abs(frame.time - 0.5) < 0.3:
             write_image(frame.image_path, np.zeros((40, 40, 4), np.uint8))
-    assert _found(flight, make_config("draft", {"time_window": window})) == (60_000, window or 1.0)
+    assert _found(flight, _draft(time_window=window)) == (60_000, window or 1.0)
 
 
 def test_what_looks_like_the_background_has_no_points(flight: Path) -> None:
@@ -128,9 +148,9 @@ def test_pictures_without_alpha_show_what_is_not_of_the_background(flight: Path)
 
 
 def test_without_alpha_a_clip_begins_with_as_few_points_and_the_same_part_of_it(flight: Path) -> None:
-    count, window = _found(flight, make_config("draft"))
+    count, window = _found(flight, _draft())
     without_alpha(flight)
-    flat, same = _found(flight, make_config("draft"))
+    flat, same = _found(flight, _draft())
     assert same == window
     assert count <= flat < 1.5 * count
 
@@ -138,7 +158,7 @@ def test_without_alpha_a_clip_begins_with_as_few_points_and_the_same_part_of_it(
 def test_pictures_of_the_background_alone_leave_all_points(flight: Path) -> None:
     for frame in load_capture(flight).train:
         write_image(frame.image_path, np.full((40, 40, 3), 255, np.uint8))
-    assert _found(flight, make_config("draft")) == (60_000, 1.0)
+    assert _found(flight, _draft()) == (60_000, 1.0)
 
 
 def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
