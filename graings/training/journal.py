@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -131,6 +131,7 @@ class Journal:
         self,
         iteration: int,
         scene: Scene,
+        background: Sequence[float],
         guard: Guard,
         threads: int,
         splits: dict[str, Any],
@@ -143,7 +144,6 @@ class Journal:
         of the end over all training views; they only exist once the run has ended.
         """
         started = time.perf_counter()
-        background = self.config.capture.background_rgb()
         fps = frames_per_second(scene, subset(self.capture.train, FPS_VIEWS), background)
         machine = machine_facts(threads)
         self.clock.add("report", time.perf_counter() - started)

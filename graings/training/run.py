@@ -62,10 +62,11 @@ class TrainingRun:
         self.config = config
         self.threads = use_threads(threads if threads is not None else config.threads)
         self.plan: Plan = make_plan(capture, config)
-        self.applied = self.plan.apply(config)
-        self.images = ImageStore(config.capture.background_rgb(), config.capture.cache_mb)
-        self._journal = Journal(folder, capture, config, self.plan, clock)
         started, computed = time.perf_counter(), time.process_time()
+        seen = with_background(config.capture, capture)
+        self.applied = self.plan.apply(config).model_copy(update={"capture": seen})
+        self.images = ImageStore(seen.background_rgb(), seen.cache_mb)
+        self._journal = Journal(folder, capture, config, self.plan, clock)
         self._trainer = Trainer(capture, self.images, self.applied)
         clock.add("init", time.perf_counter() - started, time.process_time() - computed)
         self._best_psnr: float | None = None
@@ -81,9 +82,8 @@ class TrainingRun:
         clock = Clock()
         started = time.perf_counter()
         data = load_capture(capture, config.capture)
-        settled = config.model_copy(update={"capture": with_background(config.capture, data)})
         clock.add("load", time.perf_counter() - started)
-        run = cls(folder, data, settled, None, clock)
+        run = cls(folder, data, config, None, clock)
         folder.mkdir(parents=True, exist_ok=True)
         run._journal.write_run()
         return run
@@ -195,7 +195,7 @@ class TrainingRun:
                 {"trainer": facts, **self._journal.state()},
             ),
             units=self.capture.units,
-            background=self.config.capture.background_rgb(),
+            background=self._trainer.background,
             views={split: [frame.view() for frame in self.capture.split(split)] for split in SPLITS},
             config=self.config,
             iteration=self.iteration,
@@ -215,7 +215,7 @@ class TrainingRun:
         if not frames:
             return None
         started = time.perf_counter()
-        metrics = evaluate(self._trainer.scene, frames, self.images, self.config.capture.background_rgb())
+        metrics = evaluate(self._trainer.scene, frames, self.images, self._trainer.background)
         point = self._point(metrics)
         self._journal.clock.add("evaluation", time.perf_counter() - started)
         if self._best_psnr is None or point.psnr > self._best_psnr:
@@ -229,8 +229,7 @@ class TrainingRun:
         point = None
         started = time.perf_counter()
         if self.capture.val:
-            background = self.config.capture.background_rgb()
-            point = self._point(evaluate(self._trainer.scene, self._held_out(), self.images, background))
+            point = self._point(evaluate(self._trainer.scene, self._held_out(), self.images, self._trainer.background))
         stiffness = self._stiffness(self.capture.train)
         self._journal.clock.add("evaluation", time.perf_counter() - started)
         said = stiffness.events()
@@ -241,8 +240,8 @@ class TrainingRun:
         return point, said
 
     def _stiffness(self, frames: Sequence[Frame]) -> Stiffness:
-        trainer, background = self._trainer, self.config.capture.background_rgb()
-        return Stiffness(trainer.step_over_size, subpixel_share(trainer.scene, frames, background), len(frames))
+        trainer = self._trainer
+        return Stiffness(trainer.step_over_size, subpixel_share(trainer.scene, frames, trainer.background), len(frames))
 
     def _export(self) -> dict[str, Any]:
         """Write the newest checkpoint as one small file: its name, its bytes, and the PSNR it has on all of val."""
@@ -250,7 +249,7 @@ class TrainingRun:
         size = write_compact(load_model(self.folder), self.folder / MODEL_FILE)
         psnr = None
         if self.capture.val:
-            scene, background = read_compact(self.folder / MODEL_FILE).scene, self.config.capture.background_rgb()
+            scene, background = read_compact(self.folder / MODEL_FILE).scene, self._trainer.background
             psnr = evaluate(scene, self.capture.val, self.images, background).psnr
         self._journal.clock.add("evaluation", time.perf_counter() - started)
         return {"file": MODEL_FILE, "bytes": size, "psnr": psnr}
@@ -260,8 +259,8 @@ class TrainingRun:
         if not self.capture.val:
             return {}
         started = time.perf_counter()
-        background = self.config.capture.background_rgb()
-        full = evaluate(self._trainer.scene, self.capture.val, self.images, background, lpips=Lpips.find())
+        trainer = self._trainer
+        full = evaluate(trainer.scene, self.capture.val, self.images, trainer.background, lpips=Lpips.find())
         self._journal.clock.add("evaluation", time.perf_counter() - started)
         return {"val": full.to_json()}
 
@@ -277,7 +276,7 @@ class TrainingRun:
         self._trainer.restore()
         best, frames = best_checkpoint(self.folder), self._held_out()
         if best is not None and self._best_psnr is not None and frames:
-            now = evaluate(self._trainer.scene, frames, self.images, self.config.capture.background_rgb())
+            now = evaluate(self._trainer.scene, frames, self.images, self._trainer.background)
             if now.psnr is None or self._best_psnr >= now.psnr:
                 state = load_state(best)
                 self._trainer.adopt(load_model(best).scene, state.tensors, state.facts["trainer"], guard)
@@ -298,7 +297,7 @@ class TrainingRun:
     ) -> None:
         trainer = self._trainer
         facts = (self.threads, splits, compact, stiffness)
-        self._journal.write_metrics(self.iteration, trainer.scene, trainer.guard, *facts)
+        self._journal.write_metrics(self.iteration, trainer.scene, trainer.background, trainer.guard, *facts)
 
     def _point(self, metrics: SplitMetrics) -> EvaluationPoint:
         stiffness = self._stiffness(subset(self.capture.train, self.config.evaluation.views))
