@@ -179,7 +179,7 @@ class DensityConfig(Part):
         lt=0.99,
         description="Opacity score that a new anchor's brightest child starts with; null inherits the parent's.",
     )
-    max_anchors: int = Field(12_000, ge=16, description="Hard budget of anchors; the largest gradients win.")
+    max_anchors: int = Field(12_000, ge=16, description="Anchors up to which growth may go; the largest gradients win.")
     memory_mb: int = Field(
         4096, ge=1, description="Memory in MB that anchors and one training step may take; growth stops where it ends."
     )
