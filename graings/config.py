@@ -50,7 +50,7 @@ class CaptureConfig(Part):
     background: Literal["auto", "white", "black"] | tuple[Channel, Channel, Channel] = Field(
         "auto",
         description="Colour behind transparent pixels, and what needs no Gaussians where it is seen: white, black or "
-        "[r, g, b] in [0, 1]. auto: the colour around pictures without alpha if it is one, else white.",
+        "[r, g, b] in [0, 1]. auto: the colour around what opaque pictures show if it is one, else white.",
     )
     times_from_names: bool = Field(False, description="COLMAP: take times from the number in the file name.")
     test_every: int = Field(

@@ -1,4 +1,4 @@
-"""Backdrop: the one colour that surrounds what pictures without alpha show, if there is one.
+"""Backdrop: the one colour that surrounds what opaque pictures show, if there is one.
 
 It is the background then: what has its colour is drawn with nothing. Knows nothing of training.
 """
@@ -21,7 +21,7 @@ SAME: Final = 8 / 255
 LEAST_SURROUNDED: Final = 0.9
 
 # So many pictures are looked at, spread over the clip.
-PICTURES: Final = 16
+PICTURES: Final = 8
 
 RGB = tuple[float, float, float]
 
@@ -29,16 +29,21 @@ RGB = tuple[float, float, float]
 def with_background(config: CaptureConfig, capture: Capture) -> CaptureConfig:
     """`config` with a colour for `background` where that is left to the pictures of `capture` (auto).
 
-    White where they have alpha, or no one colour around them. Raises `CaptureError` where one cannot be read.
+    White where they are transparent around what they show, or have no one colour there. An alpha channel alone says
+    nothing: many files have one that is opaque everywhere. Raises `CaptureError` where a picture cannot be read.
     """
     if config.background != "auto":
         return config
-    found = None if capture.has_alpha else backdrop(capture.train, ImageStore(config.background_rgb()))
-    return config.model_copy(update={"background": "white" if found is None else found})
+    white = config.background_rgb()
+    found = backdrop(capture.train, ImageStore(white))
+    return config.model_copy(update={"background": "white" if found in (None, white) else found})
 
 
 def backdrop(frames: Sequence[Frame], images: ImageStore) -> RGB | None:
-    """The colour of nearly all edges of `frames`, in steps of 1/255; None where they are of more than one."""
+    """The colour of nearly all edges of `frames`, in steps of 1/255; None where they are of more than one.
+
+    What is transparent has the background of `images`.
+    """
     chosen = np.unique(np.linspace(0, len(frames) - 1, PICTURES).round().astype(int))
     edges = np.concatenate([_edge(images.rgb(frames[index])) for index in chosen])
     colour = np.rint(np.median(edges, axis=0).astype(np.float64) * 255) / 255

@@ -234,7 +234,7 @@ class Trainer:
         if self.iteration > 1:
             return []
         events = []
-        if not self.capture.has_alpha and self.config.capture.background not in ("auto", "white"):
+        if self.background != (1.0, 1.0, 1.0):
             seen = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.background)
             events.append(f"background: {seen}; where pictures show it there is nothing")
         if (share := self.window.share(1)) < 1:

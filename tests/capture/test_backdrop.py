@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from graings.capture.backdrop import backdrop, with_background
+from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
@@ -29,13 +31,27 @@ def capture(tmp_path: Path) -> Path:
     return write_synthetic(tmp_path / "c", seed=1, frames=6, size=24)
 
 
+def _bytes(frame: Frame) -> NDArray[np.uint8]:
+    """The pixels [H, W, 3] of a frame on white."""
+    return np.rint(255 * ImageStore((1.0, 1.0, 1.0)).rgb(frame)).astype(np.uint8)
+
+
 def _background(folder: Path, config: CaptureConfig = AUTO) -> object:
     return with_background(config, load_capture(folder, config)).background
 
 
 @pytest.mark.parametrize("colour", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), GREY])
 def test_it_is_what_surrounds_the_pictures(capture: Path, colour: tuple[float, float, float]) -> None:
-    assert _background(without_alpha(capture, colour)) == colour
+    assert _background(without_alpha(capture, colour)) == ("white" if colour == (1.0, 1.0, 1.0) else colour)
+
+
+def test_an_alpha_channel_that_is_opaque_everywhere_does_not_hide_it(capture: Path) -> None:
+    without_alpha(capture, GREY)
+    for _, frame in load_capture(capture):
+        opaque = np.full((24, 24, 1), 255, np.uint8)
+        write_image(frame.image_path, np.concatenate([_bytes(frame), opaque], axis=-1))
+    assert load_capture(capture).has_alpha
+    assert np.allclose(_background(capture), GREY, atol=1e-6)  # type: ignore[arg-type]
 
 
 def test_noise_of_compression_does_not_hide_it(capture: Path) -> None:
