@@ -15,12 +15,10 @@ import torch
 from numpy.typing import NDArray
 
 from graings.camera import Camera
+from graings.capture.backdrop import SAME
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.errors import CaptureError
-
-# What differs from the background by less than this in every channel needs no Gaussians.
-CONTRAST: Final = 8 / 255
 
 # A mask is dilated by this many pixels, so that a thin moving part still counts as hit.
 MASK_MARGIN: Final = 2
@@ -53,11 +51,11 @@ class Masked:
 
 
 def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> list[Masked]:
-    """What each of `frames` shows: where it is not of the background's colour, and opaque if it has alpha."""
+    """What each of `frames` shows: where it is opaque and not of the background's colour, which needs no Gaussians."""
     found = []
     for frame in frames:
         alpha = images.alpha(frame)
-        differs = np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > CONTRAST
+        differs = np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > SAME
         opaque = np.ones_like(differs) if alpha is None else alpha > 0.5
         found.append(Masked(frame, opaque & differs, bool(opaque.any())))
     return found
