@@ -35,7 +35,7 @@ def with_background(config: CaptureConfig, capture: Capture) -> CaptureConfig:
     if config.background != "auto":
         return config
     white = config.background_rgb()
-    found = backdrop(capture.train, ImageStore(white))
+    found = backdrop(capture.train, ImageStore(white, config.cache_mb))
     return config.model_copy(update={"background": "white" if found in (None, white) else found})
 
 

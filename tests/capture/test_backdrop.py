@@ -1,4 +1,4 @@
-"""The one colour around what pictures without alpha show."""
+"""The one colour around what opaque pictures show."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
 from graings.compact import read_compact
 from graings.config import CaptureConfig
+from graings.errors import CaptureError
 from graings.evaluation import open_model
 from graings.training.run import TrainingRun
 from tests.capture.captures import pixels, without_alpha, write_dnerf, write_image
@@ -85,6 +86,22 @@ def test_a_thing_that_reaches_over_an_edge_does_not_hide_it(capture: Path) -> No
     seen[:, :4] = 0
     write_image(frame.image_path, np.rint(seen * 255).astype(np.uint8))
     assert np.allclose(_background(capture), GREY, atol=1e-6)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (5, 1), (2, 2)])
+def test_the_smallest_pictures_are_all_edge(tmp_path: Path, size: tuple[int, int]) -> None:
+    folder = write_dnerf(tmp_path / "c")
+    for index in range(4):
+        write_image(folder / f"train/r_{index:03d}.png", np.full((*size, 3), 51, np.uint8))
+    assert _background(folder) == (0.2, 0.2, 0.2)
+
+
+def test_a_picture_that_cannot_be_read_is_named(capture: Path) -> None:
+    data = load_capture(without_alpha(capture))
+    path = data.train[0].image_path
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(CaptureError, match=path.stem):
+        with_background(AUTO, data)
 
 
 def test_what_the_user_says_stands_and_alpha_means_white(capture: Path) -> None:
