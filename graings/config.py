@@ -119,9 +119,15 @@ class InitConfig(Part):
     """The first anchors. Owner: `graings.training.initialize`."""
 
     points: int = Field(60_000, ge=16, le=2_000_000, description="Random points where the capture has no cloud.")
-    carve_vote: float = Field(0.6, ge=0, le=1, description="Share of views whose mask a random point must hit to stay.")
+    carve_vote: float = Field(
+        0.6,
+        ge=0,
+        le=1,
+        description="Share of views whose mask a random point must hit to stay. Where most stay, for the pictures show "
+        "something everywhere, places that pairs of pictures agree on are taken instead. 0 leaves all as they are.",
+    )
     max_points: int = Field(
-        20_000, ge=16, description="At most this many points become first anchors: of a given cloud, or carved ones."
+        20_000, ge=16, description="At most this many points become first anchors, wherever they come from."
     )
     voxel_size: float | None = Field(
         None, ge=1e-9, description="Finest anchor cell, normalised; null: 0.7 px of the finer training views."

@@ -1,5 +1,7 @@
 """First anchors: from the capture's point cloud, or from random points that the masks allow (decision 3).
 
+Where the pictures show something everywhere, masks say nothing of where: places that pairs of pictures agree on, then.
+
 Knows nothing of networks' training; makes a scene that is ready for the first step.
 """
 
@@ -17,6 +19,7 @@ from torch import Tensor
 from graings.camera import Sampling
 from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
+from graings.capture.triangulation import triangulate
 from graings.config import TrainConfig
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
@@ -44,6 +47,10 @@ VOXEL_PER_PIXEL = 0.7
 # Voting needs enough views to outvote a few wrong masks, not all of them.
 CARVING_VIEWS = 60
 
+# Carving that leaves more of the cube than this has told nothing: what is in sight may be anywhere. Objects on a
+# background leave a quarter of it at most (bouncingballs), photographs of a room all.
+TELLS_NOTHING = 0.5
+
 NEIGHBOURS = 3
 
 
@@ -54,13 +61,23 @@ class Start:
     scene: Scene
     voxel_size: float  # normalised units
     time_window: float  # share of the clip that training begins with
+    notes: tuple[str, ...]  # what was decided on the way, in words
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstPoints:
+    """Positions [M, 3] to start from, the `time_window` they stand for, and what was decided, in words."""
+
+    positions: NDArray[np.float64]
+    time_window: float
+    notes: tuple[str, ...] = ()
 
 
 def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams) -> Start:
     """A scene of the first anchors. Raises `CaptureError` where no image shows anything."""
-    points, window = first_points(capture, images, config, streams)
+    first = first_points(capture, images, config, streams)
     cameras = [frame.camera for frame in capture.train]
-    places = torch.from_numpy(points)
+    places = torch.from_numpy(first.positions)
     voxel = config.init.voxel_size or VOXEL_PER_PIXEL / Sampling.of(cameras, content_extent(places)).reference
     anchors = torch.unique(voxel_keys(places, voxel), dim=0).double() * voxel
     extent = content_extent(anchors)  # where each place counts once, however many points a cloud has there
@@ -81,7 +98,7 @@ def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, stream
         initial_opacity=config.init.opacity,
         seed=config.seed,
     )
-    return Start(made, voxel, window)
+    return Start(made, voxel, first.time_window, first.notes)
 
 
 def content_extent(points: Tensor) -> float:
@@ -89,24 +106,39 @@ def content_extent(points: Tensor) -> float:
     return float(torch.quantile(points.norm(dim=-1).float(), 0.99)) or 1.0
 
 
-def first_points(
-    capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams
-) -> tuple[NDArray[np.float64], float]:
-    """Positions [M, 3] to start from, the capture's cloud or else carved random points, and the `time_window`.
+def first_points(capture: Capture, images: ImageStore, config: TrainConfig, streams: Streams) -> FirstPoints:
+    """The capture's cloud, or else random points as far as the images allow them, or what pairs of images agree on.
 
     The window is as configured, or else the widest in which the points still stand for what the images show.
     """
     generator = streams["init.points"]
-    window = config.time_window or 1.0
+    window, notes = config.time_window or 1.0, tuple[str, ...]()
     if capture.points is not None:
-        return _thinned(capture.points.positions, config.init.max_points, generator), window
+        return FirstPoints(_thinned(capture.points.positions, config.init.max_points, generator), window)
     half = content_half_size(capture)
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
     found = cube
     if config.init.carve_vote > 0:
         order = torch.randperm(len(capture.train), generator=generator).tolist()
-        found, window = _carved(cube, order, capture, images, config) or (cube, window)
-    return _thinned(found, config.init.max_points, generator), window
+        if carved := _carved(cube, order, capture, images, config):
+            found, window = carved
+            if len(found) > TELLS_NOTHING * len(cube):
+                found, notes = _agreed(found, capture, images)
+    return FirstPoints(_thinned(found, config.init.max_points, generator), window, notes)
+
+
+def _agreed(
+    anywhere: NDArray[np.float64], capture: Capture, images: ImageStore
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """What pairs of pictures agree on, or the points `anywhere` if that is too little; and which of them, in words."""
+    try:
+        places = triangulate(capture.train, images)
+    except ImportError:
+        hint = "pip install graings[colmap] takes them from what the pictures have in common"
+        return anywhere, (f"first points: random, for the pictures are filled and there is no cloud; {hint}",)
+    if len(places) < MIN_CARVED:
+        return anywhere, (f"first points: random, for pairs of pictures agree on {len(places)} places only",)
+    return places, (f"first points: {len(places):,} places that pairs of pictures agree on",)
 
 
 def _thinned(points: NDArray[np.float64], most: int, generator: torch.Generator) -> NDArray[np.float64]:

@@ -102,6 +102,7 @@ class Trainer:
         self.iteration = 0
         start = make_scene(capture, images, config, self.streams)
         self.scene = start.scene
+        self.start_notes = start.notes
         self.window = TimeWindow(config, [frame.time for frame in capture.train], start.time_window)
         self.pyramid = Pyramid(config, capture.train, float(self.scene.extent))
         self.snapshots = Snapshots()
@@ -233,7 +234,7 @@ class Trainer:
         """At the first step, what was decided before it; in words."""
         if self.iteration > 1:
             return []
-        events = []
+        events = list(self.start_notes)
         if self.background != (1.0, 1.0, 1.0):
             seen = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.background)
             events.append(f"background: {seen}; where pictures show it there is nothing")

@@ -85,6 +85,36 @@ def write_dnerf(folder: Path, times: list[float] | None = None, *, radius: float
     return folder
 
 
+def write_walled(folder: Path, cameras: Sequence[Camera]) -> Path:
+    """Opaque photographs of a painted floor (z = 0) that fills them, at different times; every eighth is held out."""
+    paint = np.random.default_rng(0).random((64, 64, 3))
+    frames: dict[str, list[dict[str, Any]]] = {"train": [], "val": []}
+    for index, camera in enumerate(cameras):
+        u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+        towards = local @ camera.world_to_camera[:3, :3]
+        x, y, _ = np.moveaxis(camera.center - camera.center[2] / towards[..., 2:] * towards, -1, 0)
+        colours = _between(paint, 5.0 * x, 5.0 * y)
+        name = f"images/{index:03d}"
+        write_image(folder / f"{name}.png", np.rint(255 * colours).astype(np.uint8))
+        frames["val" if index % 8 == 7 else "train"].append(entry(camera, name, index / len(cameras)))
+    for split, entries in frames.items():
+        if entries:
+            write_transforms(folder, split, entries)
+    return folder
+
+
+def _between(paint: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`paint` [n, n, 3], repeated for ever, at x and y, smoothly."""
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    wx, wy = (3 * w**2 - 2 * w**3 for w in ((x - left)[..., None], (y - top)[..., None]))
+    above, below = (
+        (1 - wx) * paint[row % len(paint), left % len(paint)] + wx * paint[row % len(paint), (left + 1) % len(paint)]
+        for row in (top, top + 1)
+    )
+    return (1 - wy) * above + wy * below
+
+
 def write_colmap(
     folder: Path,
     *,

@@ -60,8 +60,8 @@ def _draft(**options: object) -> TrainConfig:
 
 def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
     data = load_capture(capture, config.capture)
-    points, window = first_points(data, ImageStore(WHITE), config, Streams(0))
-    return len(points), window
+    first = first_points(data, ImageStore(WHITE), config, Streams(0))
+    return len(first.positions), first.time_window
 
 
 def test_a_clip_in_which_nothing_stays_in_place_begins_with_a_part_of_it(flight: Path) -> None:
@@ -78,7 +78,7 @@ def test_no_more_points_are_first_anchors_than_may_be(flight: Path) -> None:
     cloud = replace(data, points=PointCloud(_grid(), np.zeros_like(_grid(), np.float32)))
     for capture in (data, cloud):
         points, few = (
-            first_points(capture, ImageStore(WHITE), _draft(**{"init.max_points": most}), Streams(0))[0]
+            first_points(capture, ImageStore(WHITE), _draft(**{"init.max_points": most}), Streams(0)).positions
             for most in (60_000, 50)
         )
         assert len(few) == 50
@@ -112,7 +112,7 @@ def test_too_few_views_do_not_speak_for_a_part_of_the_clip(flight: Path) -> None
     config = make_config("draft")
     data = load_capture(flight, config.capture)
     few = replace(data, train=data.train[::4])
-    assert first_points(few, ImageStore(WHITE), config, Streams(0))[1] == 1.0
+    assert first_points(few, ImageStore(WHITE), config, Streams(0)).time_window == 1.0
 
 
 @pytest.mark.parametrize("window", [None, 0.25])
@@ -188,8 +188,7 @@ def test_a_small_thing_without_points_is_not_covered_by_a_large_one(accompanied:
 def test_a_small_thing_that_flies_is_reason_enough_to_begin_with_a_part_of_the_clip(accompanied: Path) -> None:
     for seed in range(3):
         data = load_capture(accompanied)
-        _, window = first_points(data, ImageStore(WHITE), make_config("draft"), Streams(seed))
-        assert window < 1
+        assert first_points(data, ImageStore(WHITE), make_config("draft"), Streams(seed)).time_window < 1
 
 
 def _grid() -> Array:

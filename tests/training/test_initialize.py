@@ -1,18 +1,25 @@
-"""What training starts with: the size of the finest cells follows the views that look closely."""
+"""What training starts with: cells as fine as near views ask for; what pictures agree on where they are filled."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from graings.camera import Camera
 from graings.capture.capture import Capture, Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
+from graings.capture.triangulation import triangulate
 from graings.config import make_config
-from graings.training.initialize import VOXEL_PER_PIXEL, Start, make_scene
+from graings.training.initialize import VOXEL_PER_PIXEL, FirstPoints, Start, first_points, make_scene
 from graings.training.streams import Streams
+from tests.capture.captures import FOV, write_walled
+from tests.training.micro import GROWING, micro_trainer, quality, said, steps
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -60,3 +67,58 @@ def test_a_camera_amid_the_content_does_not_ask_for_ever_finer_cells(capture: Ca
 
 def test_a_configured_cell_is_taken_as_it_is(capture: Capture) -> None:
     assert _start(capture, **{"init.voxel_size": 0.0625}).voxel_size == 0.0625
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Photographs that show something everywhere, without a cloud."""
+    cameras = [Camera.orbit(10.0 * i, 50.0, 4.0, fov=FOV, width=64, height=64) for i in range(16)]
+    return load_capture(write_walled(tmp_path_factory.mktemp("filled"), cameras))
+
+
+def _first(capture: Capture, **options: object) -> FirstPoints:
+    return first_points(capture, ImageStore(WHITE), make_config("draft", options), Streams(0))
+
+
+def test_filled_pictures_begin_with_what_pairs_of_them_agree_on(filled: Capture) -> None:
+    agreed = triangulate(filled.train, ImageStore(WHITE))
+    first = _first(filled)
+    np.testing.assert_array_equal(first.positions, agreed)
+    assert first.notes == (f"first points: {len(agreed):,} places that pairs of pictures agree on",)
+    few = _first(filled, **{"init.max_points": 100}).positions
+    assert len(few) == 100
+    assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in agreed.tolist()}
+
+
+def test_who_wants_random_points_gets_them(filled: Capture) -> None:
+    first = _first(filled, **{"init.carve_vote": 0.0, "init.points": 1_000})
+    assert (len(first.positions), first.notes) == (1_000, ())
+
+
+def test_filled_pictures_that_agree_on_too_little_begin_with_random_points(tmp_path: Path) -> None:
+    still = [Camera.orbit(30.0, 50.0, 4.0, fov=FOV, width=64, height=64)] * 3
+    first = _first(load_capture(write_walled(tmp_path, still)), **{"init.points": 1_000})
+    assert 500 < len(first.positions) < 1_000  # those that the camera sees
+    assert first.notes == ("first points: random, for pairs of pictures agree on 0 places only",)
+
+
+def test_without_pycolmap_filled_pictures_say_what_to_install(
+    filled: Capture, capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    first = _first(filled)
+    assert len(first.positions) == 6_000
+    assert "pip install graings[colmap]" in first.notes[0]
+    assert _first(capture).notes == ()  # objects on a background are carved without it
+
+
+def test_places_that_pictures_agree_on_are_worth_their_time(filled: Capture) -> None:
+    found = []
+    for options in ({}, {"init.carve_vote": 0.0, "init.points": 600}):
+        trainer = micro_trainer(filled.root, iterations=300, **{"density.max_anchors": 600}, **GROWING, **options)
+        reports = steps(trainer, 300)
+        assert len(said(reports[:1], "first points: ")) == (0 if options else 1)
+        assert said(reports[1:], "first points") == []
+        found.append(quality(trainer))
+    print(f"{found[0]:.2f} dB, from random points {found[1]:.2f} dB")
+    assert found[0] > found[1] + 2
