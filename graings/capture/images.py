@@ -63,7 +63,10 @@ class ImageStore:
         return image
 
     def alpha(self, frame: Frame) -> Image | None:
-        """Coverage [H, W] in [0, 1] at the size of the frame's camera; None where the file has no alpha channel."""
+        """Coverage [H, W] in [0, 1] at the size of the frame's camera; None where nothing is said to be transparent.
+
+        Many files have an alpha channel that is opaque everywhere, and mean no more by it than those without one.
+        """
         kept = self._get(frame, "alpha")
         return None if kept is None else _shown(kept)
 
@@ -112,7 +115,8 @@ class ImageStore:
             return _kept(pixels), None
         alpha = pixels[..., 3]
         rgb = pixels[..., :3] + self._background * (1.0 - alpha)[..., None]
-        return _kept(np.minimum(rgb, np.float32(1.0))), _kept(alpha)
+        coverage = _kept(alpha)
+        return _kept(np.minimum(rgb, np.float32(1.0))), None if (coverage == STEPS).all() else coverage
 
 
 def _kept(image: Image) -> Kept:

@@ -59,6 +59,18 @@ def test_straight_alpha_is_composited_on_the_background(tmp_path: Path) -> None:
     np.testing.assert_array_equal(alpha, image[..., 3].astype(np.float32) / np.float32(255))
 
 
+@pytest.mark.parametrize("size", [(9, 7), (4, 3)])
+def test_alpha_that_is_opaque_everywhere_says_no_more_than_none(tmp_path: Path, size: tuple[int, int]) -> None:
+    image = pixels(7, 9)
+    image[..., 3] = 255
+    opaque, plain = (write_image(tmp_path / name, each) for name, each in (("a.png", image), ("b.png", image[..., :3])))
+    store = ImageStore(BLUE)
+    assert store.alpha(frame_of(opaque, size=size)) is None
+    np.testing.assert_array_equal(store.rgb(frame_of(opaque, size=size)), store.rgb(frame_of(plain, size=size)))
+    image[3, 3, 3] = 254
+    assert store.alpha(frame_of(write_image(tmp_path / "c.png", image))) is not None
+
+
 def test_sixteen_bit_pixels_keep_their_precision(tmp_path: Path) -> None:
     image = np.arange(60, dtype=np.uint16).reshape(4, 5, 3) * 1000 + 7
     rgb = ImageStore(BLUE).rgb(frame_of(write_image(tmp_path / "a.png", image)))
