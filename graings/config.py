@@ -123,8 +123,8 @@ class InitConfig(Part):
         0.6,
         ge=0,
         le=1,
-        description="Share of views whose mask a random point must hit to stay. Where most stay, for the pictures show "
-        "something everywhere, places that pairs of pictures agree on are taken instead. 0 leaves all as they are.",
+        description="Share of views whose mask a random point must hit to stay. Where pictures are filled, places that "
+        "pairs of them agree on are taken instead. 0 leaves random points as they are.",
     )
     max_points: int = Field(
         20_000, ge=16, description="At most this many points become first anchors, wherever they come from."

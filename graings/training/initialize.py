@@ -47,9 +47,9 @@ VOXEL_PER_PIXEL = 0.7
 # Voting needs enough views to outvote a few wrong masks, not all of them.
 CARVING_VIEWS = 60
 
-# Carving that leaves more of the cube than this has told nothing: what is in sight may be anywhere. Objects on a
-# background leave a quarter of it at most (bouncingballs), photographs of a room all.
-TELLS_NOTHING = 0.5
+# Pictures that show something in more than this share of their pixels do not say where there is nothing. Objects on a
+# background take a third at most (bouncingballs), a room all but what has the background's colour.
+FILLED = 0.7
 
 NEIGHBOURS = 3
 
@@ -112,33 +112,44 @@ def first_points(capture: Capture, images: ImageStore, config: TrainConfig, stre
     The window is as configured, or else the widest in which the points still stand for what the images show.
     """
     generator = streams["init.points"]
-    window, notes = config.time_window or 1.0, tuple[str, ...]()
+    window, most = config.time_window or 1.0, config.init.max_points
     if capture.points is not None:
-        return FirstPoints(_thinned(capture.points.positions, config.init.max_points, generator), window)
+        return FirstPoints(_thinned(capture.points.positions, most, generator), window)
     half = content_half_size(capture)
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
-    found = cube
-    if config.init.carve_vote > 0:
-        order = torch.randperm(len(capture.train), generator=generator).tolist()
-        if carved := _carved(cube, order, capture, images, config):
-            found, window = carved
-            if len(found) > TELLS_NOTHING * len(cube):
-                found, notes = _agreed(found, capture, images)
-    return FirstPoints(_thinned(found, config.init.max_points, generator), window, notes)
+    if config.init.carve_vote == 0:
+        return FirstPoints(_thinned(cube, most, generator), window)
+    order = torch.randperm(len(capture.train), generator=generator).tolist()
+    whole = _voters(capture, images, config, order, 1.0)
+    refuse_empty(whole)  # in a part of the clip all may be out of sight
+    notes: tuple[str, ...] = ()
+    if np.mean([view.mask.mean() for view in whole]) > FILLED:
+        places, notes = _agreed(capture, images)
+        if places is not None:
+            return FirstPoints(_thinned(places, most, generator), window, notes)
+    carved, window = _carved(cube, order, whole, capture, images, config) or (cube, window)
+    return FirstPoints(_thinned(carved, most, generator), window, notes)
 
 
-def _agreed(
-    anywhere: NDArray[np.float64], capture: Capture, images: ImageStore
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """What pairs of pictures agree on, or the points `anywhere` if that is too little; and which of them, in words."""
+def _agreed(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """What pairs of pictures agree on, None where that is too little; and what becomes of it, in words."""
     try:
         places = triangulate(capture.train, images)
     except ImportError:
         hint = "pip install graings[colmap] takes them from what the pictures have in common"
-        return anywhere, (f"first points: random, for the pictures are filled and there is no cloud; {hint}",)
+        return None, (f"first points: random, for the pictures are filled and there is no cloud; {hint}",)
     if len(places) < MIN_CARVED:
-        return anywhere, (f"first points: random, for pairs of pictures agree on {len(places)} places only",)
+        return None, (f"first points: random, for pairs of pictures agree on {len(places)} places only",)
     return places, (f"first points: {len(places):,} places that pairs of pictures agree on",)
+
+
+def _voters(
+    capture: Capture, images: ImageStore, config: TrainConfig, order: Sequence[int], share: float
+) -> list[Masked]:
+    """What the first views in `order` show of those in the middle `share` of the clip."""
+    window = TimeWindow(config, [frame.time for frame in capture.train], share)
+    chosen = sorted([view for view in order if window.has(view, 0)][:CARVING_VIEWS])
+    return masked([capture.train[view] for view in chosen], images, config.capture.background_rgb())
 
 
 def _thinned(points: NDArray[np.float64], most: int, generator: torch.Generator) -> NDArray[np.float64]:
@@ -149,23 +160,22 @@ def _thinned(points: NDArray[np.float64], most: int, generator: torch.Generator)
 
 
 def _carved(
-    cube: NDArray[np.float64], order: Sequence[int], capture: Capture, images: ImageStore, config: TrainConfig
+    cube: NDArray[np.float64],
+    order: Sequence[int],
+    whole: Sequence[Masked],
+    capture: Capture,
+    images: ImageStore,
+    config: TrainConfig,
 ) -> tuple[NDArray[np.float64], float] | None:
-    """What the images leave of `cube`, the first views in `order` voting, and the share of the clip; None: nothing."""
-    times = [frame.time for frame in capture.train]
+    """What the images leave of `cube`, the first views in `order` voting, and the share of the clip; None: nothing.
+
+    `whole` are the voters of all of the clip.
+    """
     # A cell of a picture is a little less than the points' spacing as it appears there.
     cells = math.ceil(1.25 * len(cube) ** (1 / 3))
-
-    def seen(share: float) -> list[Masked]:
-        window = TimeWindow(config, times, share)
-        chosen = sorted([view for view in order if window.has(view, 0)][:CARVING_VIEWS])
-        return masked([capture.train[view] for view in chosen], images, config.capture.background_rgb())
-
-    whole = seen(1.0)
-    refuse_empty(whole)  # in a part of the clip all may be out of sight
     best, most = None, -1.0
     for share in SHARES if config.time_window is None else [config.time_window]:
-        views = whole if share == 1 else seen(share)
+        views = whole if share == 1 else _voters(capture, images, config, order, share)
         if config.time_window is None and share < 1 and len(views) < MIN_VIEWS:
             break
         kept = carve(cube, views, config.init.carve_vote)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -88,6 +89,16 @@ def test_filled_pictures_begin_with_what_pairs_of_them_agree_on(filled: Capture)
     few = _first(filled, **{"init.max_points": 100}).positions
     assert len(few) == 100
     assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in agreed.tolist()}
+
+
+def test_cameras_that_look_outwards_are_filled_though_most_of_the_cube_is_behind_them(tmp_path: Path) -> None:
+    cameras = []
+    for angle in np.radians(np.arange(0.0, 360.0, 15.0)):
+        x, y = math.cos(angle), math.sin(angle)
+        cameras.append(Camera.look_at((x, y, 2.0), (3 * x, 3 * y, 0.0), fov=FOV, width=64, height=64))
+    capture = load_capture(write_walled(tmp_path, cameras))
+    assert any("look outwards" in note for note in capture.notes)
+    assert _first(capture).notes[0].endswith(" that pairs of pictures agree on")
 
 
 def test_who_wants_random_points_gets_them(filled: Capture) -> None:
