@@ -46,6 +46,9 @@ LEAST_ANGLE: Final = 1.5
 # Pictures that look more than 60 degrees apart seldom show the same side of anything.
 LEAST_ALIKE: Final = 0.5
 
+# Parts along the longer side of a picture, in each of which there should be a place.
+PARTS: Final = 12
+
 LUMA: Final = np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -57,11 +60,19 @@ class Features:
     descriptors: Tensor
 
 
-def triangulate(frames: Sequence[Frame], images: ImageStore) -> Array:
-    """Positions [M, 3], in normalised units, of what two of `frames` and more see; none where nothing stands out.
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangulated:
+    """Places [M, 3] that pictures agree on, and those [K, 3] guessed in between; normalised units."""
 
-    Matches that share a feature are one thing, and its place is the median of theirs. Raises `ImportError` without
-    pycolmap, and `CaptureError` where a picture cannot be read.
+    places: Array
+    between: Array
+
+
+def triangulate(frames: Sequence[Frame], images: ImageStore) -> Triangulated:
+    """Places of what two of `frames` and more see, and of what lies between these in each picture.
+
+    Matches that share a feature are one thing, and its place is the median of theirs. Where nothing stands out there
+    are none. Raises `ImportError` without pycolmap, and `CaptureError` where a picture cannot be read.
     """
     extractor = _extractor()
     chosen = [frames[index] for index in _spread(len(frames), PICTURES)]
@@ -74,7 +85,32 @@ def triangulate(frames: Sequence[Frame], images: ImageStore) -> Array:
         met, where = meetings(cameras[one], cameras[other], features[one].pixels[a], features[other].pixels[b])
         places.append(where)
         links.append(np.stack([first[one] + a[met], first[other] + b[met]]))
-    return _medians(np.concatenate(places), tracks(np.concatenate(links, axis=1), int(first[-1])))
+    ends = np.concatenate(links, axis=1)
+    things, number = np.unique(tracks(ends, int(first[-1])), return_inverse=True)
+    found = _medians(np.concatenate(places), number, len(things))
+    guessed = [np.empty((0, 3))]
+    for camera, begin, end in zip(cameras, first[:-1], first[1:], strict=True):
+        own = ((ends >= begin) & (ends < end)).any(axis=0)
+        guessed.append(between(camera, found[np.unique(number[own])]))
+    return Triangulated(found, np.concatenate(guessed))
+
+
+def between(camera: Camera, seen: Array) -> Array:
+    """One place [K, 3] for each part of a picture without any of those `seen` [m, 3], as deep as the nearest is.
+
+    What looks the same everywhere, a wall or the sky, has no features; what grows later needs something near it.
+    """
+    if len(seen) == 0:
+        return np.empty((0, 3))
+    pixels, depths = _pixels(camera, seen)
+    size = max(camera.width, camera.height) / PARTS
+    u, v = np.meshgrid(np.arange(size / 2, camera.width, size), np.arange(size / 2, camera.height, size))
+    middles = np.column_stack([u.ravel(), v.ravel()])
+    apart = np.linalg.norm(middles[:, None] - pixels, axis=-1)
+    empty = apart.min(axis=1) > size
+    rays = _towards(camera, middles[empty])
+    places: Array = camera.center + depths[apart.argmin(axis=1)[empty], None] * rays
+    return places
 
 
 def tracks(links: NDArray[np.int64], count: int) -> NDArray[np.int64]:
@@ -90,12 +126,10 @@ def tracks(links: NDArray[np.int64], count: int) -> NDArray[np.int64]:
             return least
 
 
-def _medians(places: Array, groups: NDArray[np.int64]) -> Array:
-    """The median of each axis over every group of `places` [m, 3], in the order of their numbers."""
-    order = np.argsort(groups, kind="stable")
-    _, begins = np.unique(groups[order], return_index=True)
-    found = [np.median(part, axis=0) for part in np.split(places[order], begins[1:])] if len(places) else []
-    return np.array(found, dtype=np.float64).reshape(-1, 3)
+def _medians(places: Array, number: NDArray[np.int64], count: int) -> Array:
+    """[count, 3]: the median of each axis over those of `places` [m, 3] that have the same `number`."""
+    parts = np.split(places[np.argsort(number, kind="stable")], np.cumsum(np.bincount(number, minlength=count))[:-1])
+    return np.array([np.median(part, axis=0) for part in parts if len(part)]).reshape(-1, 3)
 
 
 def _extractor() -> pycolmap.FeatureExtractor:
@@ -162,21 +196,34 @@ def meetings(one: Camera, other: Camera, pixels: Array, others: Array) -> tuple[
     return wide[met], places[met]
 
 
-def _rays(camera: Camera, pixels: Array) -> Array:
-    """Unit directions in the world of pixels [m, 2]."""
+def _towards(camera: Camera, pixels: Array) -> Array:
+    """Directions in the world of pixels [m, 2], as long as it takes to get one unit deeper."""
     local = np.column_stack(
         [(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy, np.ones(len(pixels))]
     )
-    directions = local @ camera.world_to_camera[:3, :3]
+    directions: Array = local @ camera.world_to_camera[:3, :3]
+    return directions
+
+
+def _rays(camera: Camera, pixels: Array) -> Array:
+    """Unit directions in the world of pixels [m, 2]."""
+    directions = _towards(camera, pixels)
     unit: Array = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     return unit
 
 
-def _sees(camera: Camera, places: Array, pixels: Array) -> NDArray[np.bool_]:
-    """Whether `camera` sees `places` [m, 3] in front of it and not `FARTHEST` from `pixels` [m, 2]."""
+def _pixels(camera: Camera, places: Array) -> tuple[Array, Array]:
+    """Where `places` [m, 3] in front of the camera appear, [m, 2], and how deep they are, [m]."""
     local = places @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     depth = local[:, 2]
-    x, y = camera.fx * local[:, 0] + camera.cx * depth, camera.fy * local[:, 1] + camera.cy * depth
-    missed = np.hypot(x - pixels[:, 0] * depth, y - pixels[:, 1] * depth)  # times depth, which may be 0
-    near: NDArray[np.bool_] = (depth > 0) & (missed < FARTHEST * depth)
-    return near
+    x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
+    return np.column_stack([x, y]), depth
+
+
+def _sees(camera: Camera, places: Array, pixels: Array) -> NDArray[np.bool_]:
+    """Whether `camera` sees `places` [m, 3] in front of it and not `FARTHEST` from `pixels` [m, 2]."""
+    deep = (places - camera.center) @ camera.forward > 0
+    seen = np.zeros(len(places), np.bool_)
+    at, _ = _pixels(camera, places[deep])
+    seen[deep] = np.linalg.norm(at - pixels[deep], axis=-1) < FARTHEST
+    return seen

@@ -134,13 +134,15 @@ def first_points(capture: Capture, images: ImageStore, config: TrainConfig, stre
 def _agreed(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
     """What pairs of pictures agree on, None where that is too little; and what becomes of it, in words."""
     try:
-        places = triangulate(capture.train, images)
+        found = triangulate(capture.train, images)
     except ImportError:
         hint = "pip install graings[colmap] takes them from what the pictures have in common"
         return None, (f"first points: random, for the pictures are filled and there is no cloud; {hint}",)
-    if len(places) < MIN_CARVED:
-        return None, (f"first points: random, for pairs of pictures agree on {len(places)} places only",)
-    return places, (f"first points: {len(places):,} places that pairs of pictures agree on",)
+    count = len(found.places)
+    if count < MIN_CARVED:
+        return None, (f"first points: random, for pairs of pictures agree on {count} places only",)
+    said = f"first points: {count:,} places that pairs of pictures agree on, and {len(found.between):,} between them"
+    return np.concatenate([found.places, found.between]), (said,)
 
 
 def _voters(

@@ -13,7 +13,7 @@ from graings.camera import Camera
 from graings.capture import triangulation
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
-from graings.capture.triangulation import meetings, tracks, triangulate
+from graings.capture.triangulation import between, meetings, tracks, triangulate
 from tests.capture.captures import FOV, entry, write_image, write_transforms, write_walled
 
 DISTANCE = 4.0
@@ -25,7 +25,9 @@ Array = NDArray[np.float64]
 
 def _places(folder: Path) -> Array:
     capture = load_capture(folder)
-    return capture.units.points_back(triangulate(capture.train, ImageStore((1.0, 1.0, 1.0))))
+    found = triangulate(capture.train, ImageStore((1.0, 1.0, 1.0)))
+    assert len(found.between) == 0 or len(found.places) > 0
+    return capture.units.points_back(found.places)
 
 
 def _cameras(azimuths: Sequence[float]) -> list[Camera]:
@@ -77,8 +79,24 @@ def test_long_clips_cost_no_more_than_their_sixty_pictures(tmp_path: Path, monke
             read.append(frame.name)
             return super().rgb(frame)
 
-    assert triangulate(capture.train, Watched((1.0, 1.0, 1.0))).shape[1] == 3
+    triangulate(capture.train, Watched((1.0, 1.0, 1.0)))
     assert read == [capture.train[index].name for index in (0, 3, 6)]
+
+
+def test_what_lies_between_places_is_as_deep_as_the_nearest(tmp_path: Path) -> None:
+    camera = _cameras([20.0])[0]
+    part = SIZE / 12
+    ends = np.array([[0.4 * part, 0.4 * part], [SIZE - 0.4 * part, 0.4 * part]])
+    depths = np.array([2.0, 5.0])
+    rays = np.column_stack([(ends - camera.cx) / camera.fx, np.ones(2)]) @ camera.world_to_camera[:3, :3]
+    guessed = between(camera, camera.center + depths[:, None] * rays)
+    pixels = _pixels(camera, guessed)
+    # One in the middle of each of 12 x 12 parts, but for the two corners.
+    wanted = {(x, y) for x in range(12) for y in range(12)} - {(0, 0), (11, 0)}
+    assert sorted(map(tuple, np.floor(pixels / part).astype(int).tolist())) == sorted(wanted)
+    left = np.linalg.norm(pixels - ends[0], axis=-1) < np.linalg.norm(pixels - ends[1], axis=-1)
+    np.testing.assert_allclose((guessed - camera.center) @ camera.forward, np.where(left, *depths), rtol=1e-9)
+    assert between(camera, np.empty((0, 3))).shape == (0, 3)
 
 
 def test_rays_meet_where_both_cameras_saw_it() -> None:

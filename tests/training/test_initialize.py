@@ -82,10 +82,14 @@ def _first(capture: Capture, **options: object) -> FirstPoints:
 
 
 def test_filled_pictures_begin_with_what_pairs_of_them_agree_on(filled: Capture) -> None:
-    agreed = triangulate(filled.train, ImageStore(WHITE))
+    found = triangulate(filled.train, ImageStore(WHITE))
+    agreed = np.concatenate([found.places, found.between])
     first = _first(filled)
     np.testing.assert_array_equal(first.positions, agreed)
-    assert first.notes == (f"first points: {len(agreed):,} places that pairs of pictures agree on",)
+    counts = len(found.places), len(found.between)
+    assert first.notes == (
+        f"first points: {counts[0]:,} places that pairs of pictures agree on, and {counts[1]:,} between them",
+    )
     few = _first(filled, **{"init.max_points": 100}).positions
     assert len(few) == 100
     assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in agreed.tolist()}
@@ -98,7 +102,7 @@ def test_cameras_that_look_outwards_are_filled_though_most_of_the_cube_is_behind
         cameras.append(Camera.look_at((x, y, 2.0), (3 * x, 3 * y, 0.0), fov=FOV, width=64, height=64))
     capture = load_capture(write_walled(tmp_path, cameras))
     assert any("look outwards" in note for note in capture.notes)
-    assert _first(capture).notes[0].endswith(" that pairs of pictures agree on")
+    assert _first(capture).notes[0].endswith(" between them")
 
 
 def test_who_wants_random_points_gets_them(filled: Capture) -> None:
