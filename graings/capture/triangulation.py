@@ -100,6 +100,7 @@ def between(camera: Camera, seen: Array) -> Array:
 
     What looks the same everywhere, a wall or the sky, has no features; what grows later needs something near it.
     """
+    seen = seen[_in_front(camera, seen)]  # the median of a thing's places need not be where each of them is
     if len(seen) == 0:
         return np.empty((0, 3))
     pixels, depths = _pixels(camera, seen)
@@ -222,8 +223,14 @@ def _pixels(camera: Camera, places: Array) -> tuple[Array, Array]:
 
 def _sees(camera: Camera, places: Array, pixels: Array) -> NDArray[np.bool_]:
     """Whether `camera` sees `places` [m, 3] in front of it and not `FARTHEST` from `pixels` [m, 2]."""
-    deep = (places - camera.center) @ camera.forward > 0
+    deep = _in_front(camera, places)
     seen = np.zeros(len(places), np.bool_)
     at, _ = _pixels(camera, places[deep])
     seen[deep] = np.linalg.norm(at - pixels[deep], axis=-1) < FARTHEST
     return seen
+
+
+def _in_front(camera: Camera, places: Array) -> NDArray[np.bool_]:
+    """Which of `places` [m, 3] are in front of the camera."""
+    ahead: NDArray[np.bool_] = (places - camera.center) @ camera.forward > 0
+    return ahead

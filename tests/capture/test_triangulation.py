@@ -96,7 +96,8 @@ def test_what_lies_between_places_is_as_deep_as_the_nearest(tmp_path: Path) -> N
     assert sorted(map(tuple, np.floor(pixels / part).astype(int).tolist())) == sorted(wanted)
     left = np.linalg.norm(pixels - ends[0], axis=-1) < np.linalg.norm(pixels - ends[1], axis=-1)
     np.testing.assert_allclose((guessed - camera.center) @ camera.forward, np.where(left, *depths), rtol=1e-9)
-    assert between(camera, np.empty((0, 3))).shape == (0, 3)
+    behind = camera.center - camera.forward
+    assert between(camera, np.stack([behind, behind])).shape == between(camera, np.empty((0, 3))).shape == (0, 3)
 
 
 def test_rays_meet_where_both_cameras_saw_it() -> None:
