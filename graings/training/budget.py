@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from graings.config import SceneConfig
+from graings.config import SceneConfig, TrainConfig
 from graings.scene.encoding import direction_width, encoding_width
 
 FLOAT: Final = 4
@@ -48,6 +48,11 @@ def bytes_per_anchor(config: SceneConfig, views: int) -> int:
         networks *= views
     activations = BOTH_WAYS * FLOAT * (k * (networks + views * CHILD_FLOATS) + views * heads)
     return FLOAT * rows * COPIES + fixed + activations
+
+
+def most_anchors(config: TrainConfig) -> int:
+    """Anchors that growth may reach: as many as are wished for, if memory holds them."""
+    return min(config.density.max_anchors, affordable_anchors(config.scene, config.batch, config.density.memory_mb))
 
 
 def affordable_anchors(config: SceneConfig, views: int, memory_mb: int) -> int:

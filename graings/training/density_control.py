@@ -14,7 +14,7 @@ from torch import Tensor
 from graings.config import TrainConfig
 from graings.scene.scene import Scene
 from graings.training import density
-from graings.training.budget import affordable_anchors
+from graings.training.budget import most_anchors
 from graings.training.collapse import mean_logits
 from graings.training.density import DensityStatistics
 from graings.training.optimizer import Optimizer
@@ -27,9 +27,7 @@ class DensityControl:
     """Grows and prunes one scene. `voxel_size` is that of the finest cells, normalised."""
 
     def __init__(self, config: TrainConfig, scene: Scene, voxel_size: float) -> None:
-        affordable = affordable_anchors(config.scene, config.batch, config.density.memory_mb)
-        budget = min(config.density.max_anchors, affordable)
-        self.config = config.density.model_copy(update={"max_anchors": budget})
+        self.config = config.density.model_copy(update={"max_anchors": most_anchors(config)})
         self.scaled = config.scaled
         self.voxel_size = voxel_size
         self.next_uid = scene.scaffold.count

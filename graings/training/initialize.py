@@ -23,6 +23,7 @@ from graings.capture.triangulation import triangulate
 from graings.config import TrainConfig
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
+from graings.training.budget import most_anchors
 from graings.training.carving import (
     LEAST_COVERED,
     MIN_CARVED,
@@ -126,7 +127,8 @@ def first_points(capture: Capture, images: ImageStore, config: TrainConfig, stre
     if np.mean([view.mask.mean() for view in whole]) > FILLED:
         places, notes = _agreed(capture, images)
         if places is not None:
-            return FirstPoints(_thinned(places, most, generator), window, notes)
+            # More than may grow would leave no room for what moves. Carved points lie inside of things and soon go.
+            return FirstPoints(_thinned(places, min(most, most_anchors(config)), generator), window, notes)
     carved, window = _carved(cube, order, whole, capture, images, config) or (cube, window)
     return FirstPoints(_thinned(carved, most, generator), window, notes)
 

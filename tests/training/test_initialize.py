@@ -90,9 +90,10 @@ def test_filled_pictures_begin_with_what_pairs_of_them_agree_on(filled: Capture)
     assert first.notes == (
         f"first points: {counts[0]:,} places that pairs of pictures agree on, and {counts[1]:,} between them",
     )
-    few = _first(filled, **{"init.max_points": 100}).positions
-    assert len(few) == 100
-    assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in agreed.tolist()}
+    for option in ("init.max_points", "density.max_anchors"):
+        few = _first(filled, **{option: 100}).positions
+        assert len(few) == 100
+        assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in agreed.tolist()}
 
 
 def test_cameras_that_look_outwards_are_filled_though_most_of_the_cube_is_behind_them(tmp_path: Path) -> None:
