@@ -22,7 +22,7 @@ from graings.config import PRESETS, make_config
 from graings.interrupt import Interrupt
 from graings.progress import TrainingProgress
 from graings.report import read_metrics
-from graings.terminal import metrics_line, say
+from graings.terminal import metrics_line, say, waiting
 from graings.training.run import TrainingRun
 
 Threads = Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads; left out: all cores.")]
@@ -55,7 +55,8 @@ def train(
     if resume:
         if preset is not None or settings:
             raise typer.BadParameter("a resumed run keeps its options; leave out --preset and --set")
-        run = TrainingRun.resume(output, capture=capture, threads=threads)
+        with waiting("reading the capture"):
+            run = TrainingRun.resume(output, capture=capture, threads=threads)
     else:
         if capture is None:
             raise typer.BadParameter("say which capture to train on", param_hint="CAPTURE")
@@ -65,7 +66,9 @@ def train(
             overrides["preset"] = preset
         if threads is not None:
             overrides["threads"] = threads
-        run = TrainingRun.create(capture, output, make_config(overrides=overrides))
+        config = make_config(overrides=overrides)
+        with waiting("reading the capture"):
+            run = TrainingRun.create(capture, output, config)
     interrupt = _take_steps(run)
     if run.iteration < run.iterations:
         say(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations; nothing is lost.")

@@ -9,12 +9,18 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
+from rich.status import Status
 from rich.text import Text
 
 
 def say(words: str) -> None:
     """Print a line as it is: no markup, no wrapping."""
     Console().print(Text(words), soft_wrap=True)
+
+
+def waiting(words: str) -> Status:
+    """A context that shows `words` on a terminal, and that something is at work; nothing elsewhere."""
+    return Console().status(Text(words, style="dim"))
 
 
 def metrics_line(split: str, metrics: Mapping[str, Any]) -> str:
