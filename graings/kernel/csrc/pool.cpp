@@ -20,7 +20,7 @@ namespace {
 // Loops follow each other closely within a step, and waking a sleeping thread takes longer than many of them: who
 // waits looks about for this long before it sleeps, first for itself, then offering its core to others in between. Who
 // gets it back late has a neighbour there and sleeps at once.
-constexpr std::chrono::microseconds kLookAbout{1000}, kAlone{60}, kLate{30};
+constexpr std::chrono::microseconds kLookAbout{1500}, kAlone{60}, kLate{30};
 
 void relax() {
 #if defined(__x86_64__)
