@@ -14,6 +14,7 @@ from graings.capture import triangulation
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.triangulation import between, meetings, tracks, triangulate
+from graings.config import CaptureConfig
 from tests.capture.captures import FOV, entry, write_image, write_transforms, write_walled
 
 DISTANCE = 4.0
@@ -98,6 +99,15 @@ def test_what_lies_between_places_is_as_deep_as_the_nearest(tmp_path: Path) -> N
     np.testing.assert_allclose((guessed - camera.center) @ camera.forward, np.where(left, *depths), rtol=1e-9)
     behind = camera.center - camera.forward
     assert between(camera, np.stack([behind, behind])).shape == between(camera, np.empty((0, 3))).shape == (0, 3)
+
+
+def test_large_pictures_are_looked_at_as_small_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_walled(tmp_path, _cameras(range(0, 80, 10)))
+    monkeypatch.setattr(triangulation, "LONGEST", 64)
+    small = load_capture(folder, CaptureConfig(max_side=64))
+    found, same = (triangulate(each.train, ImageStore((1.0, 1.0, 1.0))) for each in (load_capture(folder), small))
+    assert len(found.places) > 100
+    np.testing.assert_array_equal(found.places, same.places)
 
 
 def test_rays_meet_where_both_cameras_saw_it() -> None:
