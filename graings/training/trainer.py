@@ -403,6 +403,8 @@ class Trainer:
     def load(self, scene: Scene, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """Continue from a scene and what `state()` gave with it."""
         self.scene = scene
+        # First points found again, with another library or on another CPU, need not have quite the same extent.
+        self.pyramid = Pyramid(self.config, self.capture.train, float(scene.extent))
         self._attach(float(facts["voxel_size"]))
         parts: dict[str, dict[str, Tensor]] = {
             name: {} for name in ("adam", "statistics", "streams", "sampler", "guard", "average")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 from dataclasses import replace
@@ -126,6 +127,21 @@ def test_without_pycolmap_filled_pictures_say_what_to_install(
     assert len(first.positions) == 6_000
     assert "pip install graings[colmap]" in first.notes[0]
     assert _first(capture).notes == ()  # objects on a background are carved without it
+
+
+def test_what_a_checkpoint_was_drawn_like_does_not_depend_on_points_found_again(
+    filled: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unbroken = micro_trainer(filled.root)
+    steps(unbroken, 3)
+    scene, (tensors, facts) = copy.deepcopy(unbroken.scene), unbroken.state()
+    tensors = {name: values.clone() for name, values in tensors.items()}
+    monkeypatch.setitem(sys.modules, "pycolmap", None)  # as on a machine without it: other points
+    resumed = micro_trainer(filled.root)
+    assert float(resumed.scene.extent) != float(unbroken.scene.extent)
+    resumed.load(scene, tensors, facts)
+    assert [r.loss for r in steps(resumed, 3)] == [r.loss for r in steps(unbroken, 3)]
+    assert resumed.scene.sampling == unbroken.scene.sampling
 
 
 def test_places_that_pictures_agree_on_are_worth_their_time(filled: Capture) -> None:
