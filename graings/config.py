@@ -52,9 +52,13 @@ class CaptureConfig(Part):
         description="Colour behind transparent pixels, and what needs no Gaussians where it is seen: white, black or "
         "[r, g, b] in [0, 1]. auto: the colour around what opaque pictures show if it is one, else white.",
     )
-    times_from_names: bool = Field(False, description="COLMAP: take times from the number in the file name.")
+    times_from_names: bool = Field(
+        False, description="Take times from the number in the file name where the capture gives none."
+    )
     test_every: int = Field(
-        8, ge=2, description="COLMAP: every n-th image by name is held out for test when there is no split."
+        8,
+        ge=2,
+        description="COLMAP, transforms.json: every n-th image by name is held out for test if there is no split.",
     )
     cache_mb: int = Field(1024, ge=16, description="Memory for decoded images in MB.")
 

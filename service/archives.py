@@ -122,7 +122,7 @@ def _unpack(archive: Path, folder: Path, limits: Limits) -> Unpacked:
                 out.write(chunk)
     if files == 0:
         raise ArchiveError(
-            "There is no file of a capture in the archive: transforms_*.json or a COLMAP model, and images."
+            "There is no file of a capture in the archive: transforms files or a COLMAP model, and images."
         )
     return Unpacked(files, total, skipped)
 

@@ -6,21 +6,21 @@ of pixels or of normalised units.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 from pydantic import ConfigDict, TypeAdapter
 
 from graings.camera import Camera
+from graings.capture.assumptions import hold_out, time_from_name
 from graings.capture.capture import Split
-from graings.capture.colmap_model import ColmapCamera, ColmapModel, read_model
+from graings.capture.colmap_camera import ColmapCamera
+from graings.capture.colmap_model import ColmapModel, read_model
 from graings.capture.folder import CaptureFolder
 from graings.capture.image_file import ImageFile
 from graings.capture.json_document import parse_json
 from graings.capture.lens import Lens
-from graings.capture.recording import FARTHEST, Recording, Shot
+from graings.capture.recording import Recording, Shot
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
 
@@ -56,12 +56,7 @@ def read_colmap(folder: CaptureFolder, config: CaptureConfig) -> Recording:
     notes: list[str] = []
     shots = _shots(folder, where, model, _times(folder, config, model), notes)
     splits = _split(folder, where, shots, config.test_every, notes)
-    finite = np.asarray((np.abs(model.positions) <= FARTHEST).all(axis=1))  # False for NaN as well
-    if not finite.all():
-        notes.append(f"{int((~finite).sum())} of {len(finite)} points are not finite or absurdly far and left out")
-    if not finite.any():
-        return Recording("colmap", splits, tuple(notes))
-    return Recording("colmap", splits, tuple(notes), model.positions[finite], model.colors[finite])
+    return Recording.with_points("colmap", splits, notes, model.positions, model.colors)
 
 
 def _shots(
@@ -86,7 +81,7 @@ def _shots(
         camera = _sized(model.cameras[image.camera_id], file, where)
         rescaled += camera is not model.cameras[image.camera_id]
         if camera not in lenses:
-            lenses[camera] = _lens(camera, where)
+            lenses[camera] = camera.lens(where, "cameras")
         lens = lenses[camera]
         pinhole, size = (
             (camera.pinhole, (camera.width, camera.height)) if lens is None else (lens.pinhole, lens.pinhole_size)
@@ -116,25 +111,6 @@ def _sized(camera: ColmapCamera, file: ImageFile, where: str) -> ColmapCamera:
     return camera.scaled(file.width, file.height)
 
 
-def _lens(camera: ColmapCamera, where: str) -> Lens | None:
-    try:
-        return Lens.of(camera.model, camera.params, (camera.width, camera.height), camera.distortion)
-    except ImportError as error:
-        raise CaptureError(
-            f"the camera model {camera.model} must be undistorted, which needs pycolmap",
-            file=where,
-            field="cameras",
-            remedy="Install it with `pip install graings[colmap]`, or undistort with `colmap image_undistorter`.",
-        ) from error
-    except ValueError as error:
-        raise CaptureError(
-            f"the camera {camera.model} {camera.params} cannot be undistorted ({error})",
-            file=where,
-            field="cameras",
-            remedy="Undistort with `colmap image_undistorter` and give its output.",
-        ) from error
-
-
 def _times(folder: CaptureFolder, config: CaptureConfig, model: ColmapModel) -> dict[str, float]:
     names = [image.name for image in model.images]
     if folder.has(TIMES_FILE):
@@ -145,44 +121,20 @@ def _times(folder: CaptureFolder, config: CaptureConfig, model: ColmapModel) -> 
         return times
     if not config.times_from_names:
         return {}
-    times = {}
-    for name in names:
-        numbers = re.findall(r"\d+", Path(name).stem)
-        if not numbers:
-            raise CaptureError(
-                "the file name holds no number to take the time from",
-                file=f"images/{name}",
-                field="name",
-                remedy="Rename it, write times.json, or switch capture.times_from_names off.",
-            )
-        times[name] = float(numbers[-1])
-    return times
+    return {name: time_from_name(f"images/{name}") for name in names}
 
 
 def _split(
     folder: CaptureFolder, where: str, shots: dict[str, Shot], every: int, notes: list[str]
 ) -> dict[Split, tuple[Shot, ...]]:
-    names = list(shots)
     listed = next((file for file in (f"{where}/{TEST_FILE}", TEST_FILE) if folder.has(file)), None)
-    if listed is not None:
-        test = {line.strip() for line in folder.read(listed).decode("utf-8", errors="surrogateescape").splitlines()}
-        unknown = sorted(test - set(names) - {""})
-        if unknown:
-            raise CaptureError(
-                f"{unknown[0]!r} is no image of the model", file=listed, remedy="Correct the name or take it out."
-            )
-        notes.append(f"test images are those of {listed}")
-    else:
-        test = set(names[::every]) if len(names) > 1 else set()
-        notes.append(f"no split is given: every {every}th image by name is held out for test ({len(test)})")
-    rest = [name for name in names if name not in test]
-    val = set(rest[every // 2 :: every])
-    notes.append(f"of the other images every {every}th is held out for val ({len(val)})")
-    train = [name for name in rest if name not in val]
-    if not train:
-        raise CaptureError("leaves no training image", file=listed or where, remedy="Hold fewer images out.")
-    return {
-        "train": tuple(shots[name] for name in train),
-        "val": tuple(shots[name] for name in rest if name in val),
-        "test": tuple(shots[name] for name in names if name in test),
-    }
+    if listed is None:
+        return hold_out(shots, every, notes, source=where)
+    test = {line.strip() for line in folder.read(listed).decode("utf-8", errors="surrogateescape").splitlines()}
+    unknown = sorted(test - set(shots) - {""})
+    if unknown:
+        raise CaptureError(
+            f"{unknown[0]!r} is no image of the model", file=listed, remedy="Correct the name or take it out."
+        )
+    notes.append(f"test images are those of {listed}")
+    return hold_out(shots, every, notes, source=listed, test=test)

@@ -10,65 +10,14 @@ import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from graings.capture.colmap_camera import CAMERA_MODELS, MODELS, ColmapCamera
 from graings.capture.folder import CaptureFolder
 from graings.errors import CaptureError
-
-# By the id in cameras.bin: name, number of parameters, number of focal lengths that lead them (cx, cy follow).
-CAMERA_MODELS: Final[dict[int, tuple[str, int, int]]] = {
-    0: ("SIMPLE_PINHOLE", 3, 1),
-    1: ("PINHOLE", 4, 2),
-    2: ("SIMPLE_RADIAL", 4, 1),
-    3: ("RADIAL", 5, 1),
-    4: ("OPENCV", 8, 2),
-    5: ("OPENCV_FISHEYE", 8, 2),
-    6: ("FULL_OPENCV", 12, 2),
-    7: ("FOV", 5, 2),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4, 1),
-    9: ("RADIAL_FISHEYE", 5, 1),
-    10: ("THIN_PRISM_FISHEYE", 12, 2),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16, 2),
-    12: ("SIMPLE_DIVISION", 4, 1),
-    13: ("DIVISION", 5, 2),
-    14: ("SIMPLE_FISHEYE", 3, 1),
-    15: ("FISHEYE", 4, 2),
-    16: ("EUCM", 6, 2),
-}
-_MODELS: Final = {name: (count, focals) for name, count, focals in CAMERA_MODELS.values()}
-
-
-@dataclass(frozen=True, slots=True)
-class ColmapCamera:
-    """Intrinsics as COLMAP writes them; `params` are focal lengths, principal point, then distortion."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-    @property
-    def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy without the distortion."""
-        focals = _MODELS[self.model][1]
-        cx, cy = self.params[focals : focals + 2]
-        return self.params[0], self.params[focals - 1], cx, cy
-
-    @property
-    def distortion(self) -> tuple[float, ...]:
-        """The parameters behind the principal point."""
-        return self.params[_MODELS[self.model][1] + 2 :]
-
-    def scaled(self, width: int, height: int) -> ColmapCamera:
-        """The same camera for pictures of another size and the same shape."""
-        sx, sy = width / self.width, height / self.height
-        focals = _MODELS[self.model][1]
-        factors = ([sx] if focals == 1 else [sx, sy]) + [sx, sy] + [1.0] * len(self.distortion)
-        params = tuple(value * factor for value, factor in zip(self.params, factors, strict=True))
-        return ColmapCamera(self.model, width, height, params)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,7 +154,7 @@ def _cameras_txt(file: _Text) -> dict[int, ColmapCamera]:
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
             file.fail(number, "is no camera (id, model, width, height, parameters)")
-        if name not in _MODELS:
+        if name not in MODELS:
             file.fail(number, f"camera {identifier} has the unknown model {name}")
         cameras[identifier] = _camera(file, identifier, name, width, height, params, number)
     file.finish(len(cameras))
@@ -255,7 +204,7 @@ def _camera(
     params: tuple[float, ...],
     number: int = 0,
 ) -> ColmapCamera:
-    count, focals = _MODELS[model]
+    count, focals = MODELS[model]
     problem = None
     if len(params) != count:
         problem = f"camera {identifier} ({model}) needs {count} parameters, has {len(params)}"

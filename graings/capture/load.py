@@ -10,10 +10,10 @@ from pathlib import Path
 
 from graings.capture.capture import Capture
 from graings.capture.colmap import find_model, read_colmap
-from graings.capture.dnerf import read_transforms
 from graings.capture.folder import CaptureFolder
 from graings.capture.normalize import normalize
 from graings.capture.recording import Recording
+from graings.capture.transforms import SINGLE_FILE, read_single_transforms, read_transforms
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
 
@@ -23,8 +23,8 @@ Reader = Callable[[CaptureFolder, CaptureConfig], Recording]
 def load_capture(path: Path, config: CaptureConfig | None = None) -> Capture:
     """The capture in the folder `path`, or in its only sub-folder that holds one.
 
-    `transforms_*.json` is preferred over a COLMAP model where both lie there. Images are checked to be whole but not
-    decoded (EXR excepted). Raises `CaptureError` naming file, field and remedy.
+    `transforms_*.json` is preferred over a COLMAP model where both lie there, and that over a lone `transforms.json`.
+    Images are checked to be whole but not decoded (EXR excepted). Raises `CaptureError` naming file, field and remedy.
     """
     config = config or CaptureConfig()
     if not path.is_dir():
@@ -44,9 +44,11 @@ def load_capture(path: Path, config: CaptureConfig | None = None) -> Capture:
 
 def _reader(path: Path) -> Reader | None:
     if any(path.glob("transforms_*.json")):
-        return lambda folder, _: read_transforms(folder)
+        return read_transforms
     if find_model(path) is not None:
         return read_colmap
+    if (path / SINGLE_FILE).is_file():
+        return read_single_transforms
     return None
 
 
@@ -59,15 +61,9 @@ def _not_found(path: Path, inner: list[Path]) -> CaptureError:
     if inner:
         names = ", ".join(child.name for child in inner)
         return CaptureError(f"holds several captures ({names})", file=path, remedy="Give one of them.")
-    if (path / "transforms.json").is_file():
-        return CaptureError(
-            "there is transforms.json but no transforms_train.json",
-            file=path,
-            remedy="Rename it to transforms_train.json and list held-out images in transforms_val.json.",
-        )
     return CaptureError(
-        "holds no capture: neither transforms_train.json (D-NeRF, NeRF-synthetic) nor a COLMAP model "
-        "(cameras, images and points3D as .bin or .txt in sparse/0, sparse or the folder itself)",
+        "holds no capture: neither transforms_train.json (D-NeRF, NeRF-synthetic) nor transforms.json (nerfstudio) nor "
+        "a COLMAP model (cameras, images and points3D as .bin or .txt in sparse/0, sparse or the folder itself)",
         file=path,
         remedy="Give the folder that holds one of them.",
     )

@@ -39,3 +39,22 @@ class Recording:
     notes: tuple[str, ...] = ()
     positions: NDArray[np.float64] | None = None
     colors: NDArray[np.float32] | None = None
+
+    @staticmethod
+    def with_points(
+        kind: Literal["transforms", "colmap"],
+        splits: dict[Split, tuple[Shot, ...]],
+        notes: list[str],
+        positions: NDArray[np.float64],
+        colors: NDArray[np.float32],
+    ) -> Recording:
+        """As the constructor, without points that cannot be computed with, of which a note then speaks."""
+        finite = np.asarray((np.abs(positions) <= FARTHEST).all(axis=1))  # False for NaN as well
+        if not finite.all():
+            notes = [
+                *notes,
+                f"{int((~finite).sum())} of {len(finite)} points are not finite or absurdly far and left out",
+            ]
+        if not finite.any():
+            return Recording(kind, splits, tuple(notes))
+        return Recording(kind, splits, tuple(notes), positions[finite], colors[finite])
