@@ -30,7 +30,7 @@ _FORM = {
 _BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "The capture: D-NeRF (transforms_*.json), nerfstudio (transforms.json) or COLMAP, packed as zip, tar or tar.gz.",
+        "description": "The capture: transforms_*.json, transforms.json or COLMAP, packed as zip, tar or tar.gz.",
         "content": {
             "application/zip": _BINARY,
             "application/x-tar": _BINARY,
