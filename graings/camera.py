@@ -18,6 +18,7 @@ Matrix = NDArray[np.float64]
 MOST = 0.9  # of the cameras of training do not look finer than the reference
 ALIKE = 1.05  # so many times finer or coarser makes no difference
 AT_ONCE = 1.5  # times coarser than the reference: down to there what training drew is served alike
+_NEAREST = 1e-9  # depths below are taken for it, where a point is projected that may lie anywhere
 _EXACT = 1e-12  # an orthonormal matrix in float64 is no worse, so that one that was made exact stays as it is
 
 
@@ -76,6 +77,16 @@ class Camera:
         """The same view sampled on a grid of `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
         return Camera(self.world_to_camera, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
+
+    def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where `points` [M, 3] appear, [M, 2] in px, and how deep they lie, [M].
+
+        Of what does not lie in front of the camera the pixel means nothing.
+        """
+        local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        depth = np.maximum(local[:, 2], _NEAREST)
+        x, y = self.fx * local[:, 0] / depth + self.cx, self.fy * local[:, 1] / depth + self.cy
+        return np.column_stack([x, y]), local[:, 2]
 
     @staticmethod
     def look_at(

@@ -31,3 +31,17 @@ def test_a_rounded_rotation_becomes_exact(spoil) -> None:  # type: ignore[no-unt
 def test_an_exact_pose_keeps_its_bits() -> None:
     pose = turned(0.7)
     assert np.array_equal(Camera(pose, 1.0, 1.0, 0.0, 0.0, 1, 1).world_to_camera, pose)
+
+
+def test_points_are_projected_as_the_docstring_says() -> None:
+    camera = Camera.orbit(30.0, 20.0, 3.0, fov=0.8, width=60, height=40)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    pixels, depths = camera.project(points)
+    for point, pixel, depth in zip(points, pixels, depths, strict=True):
+        x, y, z, _ = camera.world_to_camera @ [*point, 1.0]
+        np.testing.assert_allclose(pixel, (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), rtol=1e-12)
+        assert depth == pytest.approx(z, rel=1e-12)
+    behind = camera.center - camera.forward
+    pixels, depths = camera.project(np.stack([behind, camera.center]))
+    assert np.isfinite(pixels).all()
+    np.testing.assert_allclose(depths, [-1.0, 0.0], atol=1e-12)

@@ -106,7 +106,7 @@ def between(camera: Camera, seen: Array) -> Array:
     seen = seen[_in_front(camera, seen)]  # the median of a thing's places need not be where each of them is
     if len(seen) == 0:
         return np.empty((0, 3))
-    pixels, depths = _pixels(camera, seen)
+    pixels, depths = camera.project(seen)
     size = max(camera.width, camera.height) / PARTS
     u, v = np.meshgrid(np.arange(size / 2, camera.width, size), np.arange(size / 2, camera.height, size))
     middles = np.column_stack([u.ravel(), v.ravel()])
@@ -224,19 +224,11 @@ def _rays(camera: Camera, pixels: Array) -> Array:
     return unit
 
 
-def _pixels(camera: Camera, places: Array) -> tuple[Array, Array]:
-    """Where `places` [m, 3] in front of the camera appear, [m, 2], and how deep they are, [m]."""
-    local = places @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depth = local[:, 2]
-    x, y = camera.fx * local[:, 0] / depth + camera.cx, camera.fy * local[:, 1] / depth + camera.cy
-    return np.column_stack([x, y]), depth
-
-
 def _sees(camera: Camera, places: Array, pixels: Array) -> NDArray[np.bool_]:
     """Whether `camera` sees `places` [m, 3] in front of it and not `FARTHEST` from `pixels` [m, 2]."""
     deep = _in_front(camera, places)
     seen = np.zeros(len(places), np.bool_)
-    at, _ = _pixels(camera, places[deep])
+    at, _ = camera.project(places[deep])
     seen[deep] = np.linalg.norm(at - pixels[deep], axis=-1) < FARTHEST
     return seen
 

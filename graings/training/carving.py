@@ -76,7 +76,7 @@ def carve(points: NDArray[np.float64], views: Sequence[Masked], vote: float) -> 
     """Those of `points` [M, 3] on the dilated mask of at least a share `vote` of the views in which they lie."""
     votes, seen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
-        columns, rows, inside = project(points, view.frame.camera)
+        columns, rows, inside = _whole_pixels(points, view.frame.camera)
         mask = _dilated(view.mask, MASK_MARGIN)
         seen += inside
         votes[inside] += mask[rows[inside], columns[inside]]
@@ -98,7 +98,7 @@ def coverage(points: NDArray[np.float64], views: Sequence[Masked], cells: int) -
         if not view.mask.any():
             continue
         size = max(1, -(-max(camera.width, camera.height) // cells))
-        columns, rows, inside = project(points, camera)
+        columns, rows, inside = _whole_pixels(points, camera)
         down, across = np.arange(0, camera.height, size), np.arange(0, camera.width, size)
         shown = np.add.reduceat(np.add.reduceat(view.mask, down, axis=0, dtype=np.int64), across, axis=1)
         near = np.zeros(shown.shape, np.bool_)
@@ -111,15 +111,13 @@ def coverage(points: NDArray[np.float64], views: Sequence[Masked], cells: int) -
     return float(np.quantile(shares, WORSE)) if shares else 1.0
 
 
-def project(
+def _whole_pixels(
     points: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Pixel column and row of each point, and whether it is in front of the camera and inside the image."""
-    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depth = np.maximum(local[:, 2], 1e-9)
-    u = camera.fx * local[:, 0] / depth + camera.cx
-    v = camera.fy * local[:, 1] / depth + camera.cy
-    inside = (local[:, 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    pixels, depths = camera.project(points)
+    u, v = pixels.T
+    inside = (depths > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     columns = np.where(inside, u, 0).astype(np.int64)
     rows = np.where(inside, v, 0).astype(np.int64)
     return columns, rows, inside

@@ -10,7 +10,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +37,14 @@ from graings.plan import Plan, make_plan
 from graings.report import read_metrics
 from graings.run_folder import MODEL_FILE, RECORD_FILE, read_record, sole_trainer
 from graings.threads import use_threads
+from graings.training.attempt import Attempt
+from graings.training.carving import MIN_VIEWS
+from graings.training.initialize import CARVING_VIEWS
 from graings.training.journal import EvaluationPoint, Journal
+from graings.training.lost import FEWEST_STEPS, LOOK_AT, LOST_WINDOW, MANY, lost_share
 from graings.training.pace import Clock, Rate, evaluation_marks
 from graings.training.stiffness import Stiffness, subpixel_share
+from graings.training.time_window import TimeWindow
 from graings.training.trainer import StepReport, Trainer
 
 LOG = logging.getLogger(__name__)
@@ -56,7 +62,15 @@ class RunReport(StepReport):
 class TrainingRun:
     """One run folder being trained. Make it with `create` or `resume`."""
 
-    def __init__(self, folder: Path, capture: Capture, config: TrainConfig, threads: int | None, clock: Clock) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        capture: Capture,
+        config: TrainConfig,
+        threads: int | None,
+        clock: Clock,
+        attempt: Attempt | None = None,
+    ) -> None:
         self.folder = folder
         self.capture = capture
         self.config = config
@@ -67,8 +81,12 @@ class TrainingRun:
         self.applied = self.plan.apply(config).model_copy(update={"capture": seen})
         self.images = ImageStore(seen.background_rgb(), seen.cache_mb)
         self._journal = Journal(folder, capture, config, self.plan, clock)
-        self._trainer = Trainer(capture, self.images, self.applied)
+        self._begin(attempt or Attempt())
         clock.add("init", time.perf_counter() - started, time.process_time() - computed)
+
+    def _begin(self, attempt: Attempt) -> None:
+        self._attempt = attempt
+        self._trainer = Trainer(self.capture, self.images, attempt.config(self.applied), attempt.began)
         self._best_psnr: float | None = None
 
     @classmethod
@@ -103,23 +121,23 @@ class TrainingRun:
         if data.content_hash != record.capture_hash:
             raise CheckpointError(f"{data.root}: not the capture this run began with. Give the original one.")
         clock.add("load", time.perf_counter() - started)
-        run = cls(folder, data, config, threads, clock)
-        if newest_checkpoint(folder) is not None:
-            model, state = load_training(folder)
-            try:
-                run._trainer.load(model.scene, state.tensors, state.facts["trainer"])
-                run._journal.load(state.facts)
-            except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
-                raise CheckpointError(
-                    f"{model.path}: damaged training state ({error!r}). Remove it to go on from an earlier one."
-                ) from error
-        run._best_psnr = _psnr_of_best(folder)
+        if newest_checkpoint(folder) is None:
+            return cls(folder, data, config, threads, clock)
+        model, state = load_training(folder)
+        with _intact(model.path):
+            attempt = Attempt.of(state.facts)
+            attempt.config(config)
+        run = cls(folder, data, config, threads, clock, attempt)
+        with _intact(model.path):
+            run._trainer.load(model.scene, state.tensors, state.facts["trainer"])
+            run._journal.load(state.facts)
+        run._best_psnr = _psnr_of_best(folder, attempt)
         return run
 
     @property
     def iteration(self) -> int:
         """Iterations done."""
-        return self._trainer.iteration
+        return self._attempt.began + self._trainer.iteration
 
     @property
     def iterations(self) -> int:
@@ -145,7 +163,8 @@ class TrainingRun:
             self._finish()
         due = evaluation_marks(self.config)
         rate = Rate()
-        for step in self._trainer:
+        while self.iteration < self.iterations:
+            step = self._trainer.step()
             self._journal.clock.add(step.phase, step.seconds, step.cpu_s)
             self._journal.gaussians = step.gaussians
             rate.add(step.seconds)
@@ -155,6 +174,7 @@ class TrainingRun:
             # Nobody looks at a scene, or saves it, that is not finite.
             found = self._check() if last or saving or step.iteration in due else ()
             point = self._evaluate() if step.iteration in due and not last else None
+            found += self._look_for_lost()
             if saving and not last:
                 self._save()
             if last:
@@ -184,6 +204,35 @@ class TrainingRun:
         self._journal.note(self.iteration, found)
         return found
 
+    def _look_for_lost(self) -> tuple[str, ...]:
+        """Once, early enough: begin again in a part of the clip where training has lost what moves in all of it.
+
+        What is lost once is not found again. The iterations are spent. A window that was asked for, or that the masks
+        asked for, stays.
+        """
+        trainer, mark = self._trainer, self.applied.scaled(LOOK_AT)
+        chosen = self.applied.time_window is not None or trainer.window.share(1) < 1
+        if self.iteration != mark or mark < FEWEST_STEPS or self._attempt.began > 0 or chosen:
+            return ()
+        if not trainer.scene.temporal or len(self.capture.times) < 2:
+            return ()
+        part = TimeWindow(self.applied, [frame.time for frame in self.capture.train], LOST_WINDOW)
+        if sum(part.has(view, 0) for view in range(len(self.capture.train))) < MIN_VIEWS:
+            return ()
+        started, computed = time.perf_counter(), time.process_time()
+        frames = subset(self.capture.train, CARVING_VIEWS)
+        share = lost_share(trainer.scene, frames, self.images, trainer.background)
+        said: tuple[str, ...] = ()
+        if share > MANY:
+            self._begin(Attempt(self.iteration, LOST_WINDOW))
+            said = (
+                f"time_window: begins again, in the middle of the clip: in {share:.0%} of the views something large "
+                "that moves was lost. `time_window=1` keeps what there is.",
+            )
+            self._journal.note(self.iteration, said)
+        self._journal.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
+        return said
+
     def _save(self, *, finished: bool = False, best: bool = False, instead_of_later: bool = False) -> Path:
         started = time.perf_counter()
         tensors, facts = self._trainer.state()
@@ -192,7 +241,7 @@ class TrainingRun:
             scene=self._trainer.scene,
             state=TrainingState(
                 tensors,
-                {"trainer": facts, **self._journal.state()},
+                {"trainer": facts, "attempt": asdict(self._attempt), **self._journal.state()},
             ),
             units=self.capture.units,
             background=self._trainer.background,
@@ -304,13 +353,25 @@ class TrainingRun:
         return self._journal.point(self.iteration, metrics, self._trainer.scene.scaffold.count, stiffness)
 
 
-def _psnr_of_best(folder: Path) -> float | None:
-    """Held-out PSNR of the best checkpoint so far; None where none can be read."""
+@contextmanager
+def _intact(checkpoint: Path) -> Iterator[None]:
+    """Raise `CheckpointError` about `checkpoint` where what it holds does not fit."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{checkpoint}: damaged training state ({error!r}). Remove it to go on from an earlier one."
+        ) from error
+
+
+def _psnr_of_best(folder: Path, attempt: Attempt) -> float | None:
+    """Held-out PSNR of the best checkpoint of `attempt` so far; None where none can be read."""
     best = best_checkpoint(folder)
     if best is None:
         return None
     try:
-        return float(load_state(best).facts["curve"][-1]["psnr"])
+        facts = load_state(best).facts
+        return float(facts["curve"][-1]["psnr"]) if Attempt.of(facts) == attempt else None
     except (CheckpointError, KeyError, IndexError, TypeError, ValueError) as error:
         LOG.warning("%s: cannot be read (%s). The next evaluation takes its place.", best, error)
         return None

@@ -88,10 +88,15 @@ class StepReport:
 
 
 class Trainer:
-    """Optimises a scene on a capture. Iterating trains one step at a time from `iteration` on."""
+    """Optimises a scene on a capture. Iterating trains one step at a time from `iteration` on.
 
-    def __init__(self, capture: Capture, images: ImageStore, config: TrainConfig) -> None:
+    `before` iterations of a run were spent before these; reports and messages count them, `iteration` and the schedule
+    of `config` do not.
+    """
+
+    def __init__(self, capture: Capture, images: ImageStore, config: TrainConfig, before: int = 0) -> None:
         self.capture = capture
+        self.before = before
         self.images = images
         self.config = config
         self.background = config.capture.background_rgb()
@@ -194,8 +199,8 @@ class Trainer:
         events += self._watch(len(children), float(differences.detach().amax()))
         self._settle()
         return StepReport(
-            iteration=self.iteration,
-            iterations=self.config.iterations,
+            iteration=self.before + self.iteration,
+            iterations=self.before + self.config.iterations,
             phase=phase.name,
             loss=float(loss.detach()),
             psnr=statistics.mean(-10.0 * math.log10(max(mse, 1e-10)) for mse in errors),
@@ -338,8 +343,9 @@ class Trainer:
         """Restore a good moment and go on more slowly and in another order of views. The iterations are spent."""
         if self.guard.rollbacks >= self.config.guard.rollbacks:
             raise DivergedError(
-                f"Training diverged at iteration {self.iteration} after going back {self.guard.rollbacks} times: "
-                f"{problem}. The best model is kept. Train again with smaller rates (`rates`)."
+                f"Training diverged at iteration {self.before + self.iteration} after going back "
+                f"{self.guard.rollbacks} times: {problem}. The best model is kept. "
+                "Train again with smaller rates (`rates`)."
             )
         iteration, before, mended = self.iteration, self.guard, self.collapse.mended
         snapshot = self.snapshots.back()
@@ -352,7 +358,7 @@ class Trainer:
         self._slow_down()
         self.sampler = self._sampler()
         return (
-            f"rolled back to iteration {snapshot.iteration}: {problem}; "
+            f"rolled back to iteration {self.before + snapshot.iteration}: {problem}; "
             f"rates at {self.optimizer.damping:.3g} of their plan from here on"
         )
 
