@@ -68,6 +68,7 @@ class TrainingProgress:
             self._task,
             description=step.phase,
             completed=step.iteration,
+            total=step.iterations,
             speed=step.iterations_per_s,
             psnr=step.psnr,
             gaussians=step.gaussians,

@@ -114,7 +114,7 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
                 _log(f"stopped at iteration {report.iteration}, checkpoint {path.name}")
                 return ExitCode.STOPPED
     except DivergedError as error:
-        ending = {"iteration": run.iteration, "iterations": config.iterations, "attempt": attempt}
+        ending = {"iteration": run.iteration, "iterations": run.iterations, "attempt": attempt}
         progress.write({"phase": "diverged", **ending, **held_out, "events": [str(error)]})
         raise
     _report(folder)

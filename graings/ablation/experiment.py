@@ -183,12 +183,16 @@ def _place(row: Row, seed: int) -> str:
 
 
 def _numbers(run: Path, iterations: int) -> dict[str, Any] | None:
-    """The metrics document of a run that is finished, else None: before the end it has no split."""
+    """The metrics document of a run that is finished, else None: before the end it has no split.
+
+    A run that began again has more than `iterations`; one that diverged has splits, and its numbers are not the row's.
+    """
     file = run / "metrics.json"
     if not file.exists():
         return None
     numbers = read_metrics(file)
-    return numbers if numbers["iterations"] == iterations and "val" in numbers["splits"] else None
+    ended = numbers["iterations"] >= iterations and not numbers.get("diverged", False)
+    return numbers if ended and "val" in numbers["splits"] else None
 
 
 def _measurable(capture: Capture) -> None:

@@ -14,9 +14,9 @@ from graings.config import TrainConfig
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """The iterations of a run after the `began` that an earlier attempt took.
+    """All iterations that the configuration asks for, after the `began` that an earlier attempt took.
 
-    Its schedule is that of a run of so many, and its `time_window`, where it has one, goes before the configuration's.
+    Its `time_window`, where it has one, goes before the configuration's.
     """
 
     began: int = 0
@@ -28,10 +28,5 @@ class Attempt:
         return cls(**facts.get("attempt", {}))
 
     def config(self, config: TrainConfig) -> TrainConfig:
-        """That of the attempt, of a run that `config` describes. Raises `ValueError` where no iteration is left."""
-        if self.began == 0:
-            return config
-        left = config.iterations - self.began
-        if self.began < 0 or left < 1:
-            raise ValueError(f"an attempt cannot begin after {self.began} of {config.iterations} iterations")
-        return config.model_copy(update={"iterations": left, "time_window": self.time_window})
+        """`config` as the attempt follows it."""
+        return config if self.time_window is None else config.model_copy(update={"time_window": self.time_window})

@@ -21,17 +21,17 @@ from graings.render import render
 from graings.scene.scene import Scene
 
 # Mark of the 30 000 schedule at which to look: later than the slowest of the clips looked at had found what they show.
-LOOK_AT: Final = 10_000
+LOOK_AT: Final = 12_500
 
 # After fewer steps even what stays in place may not have been found; a run whose mark comes earlier is not looked at.
-FEWEST_STEPS: Final = 350
+FEWEST_STEPS: Final = 400
 
 # Above this share of the views something is lost. Of seven clips that train well none has more than a thirtieth; three
 # in which balls are lost have 0.5 and more.
 MANY: Final = 0.3
 
-# Share of the clip to begin again with.
-LOST_WINDOW: Final = 0.25
+# Shares of the clip to begin again with: the first that has enough views.
+LOST_WINDOWS: Final = (0.1, 0.25)
 
 # A picture's longer side in cells; a thing is as large as this many of them each way, and lost where the colour of each
 # is wrong by this much in the mean. Rims and limbs that lag behind are thinner.

@@ -70,10 +70,10 @@ class Rate:
         return len(self._recent) / max(self._sum, 1e-9)
 
 
-def evaluation_marks(config: TrainConfig) -> frozenset[int]:
-    """Iterations at which to evaluate: geometrically spaced."""
+def evaluation_marks(config: TrainConfig, iterations: int) -> frozenset[int]:
+    """Which of `iterations` are evaluated: geometrically spaced."""
     marks, mark = set(), float(config.evaluation.first)
-    while mark < config.iterations:
+    while mark < iterations:
         marks.add(round(mark))
         mark *= config.evaluation.factor
     return frozenset(marks)

@@ -41,7 +41,7 @@ from graings.training.attempt import Attempt
 from graings.training.carving import MIN_VIEWS
 from graings.training.initialize import CARVING_VIEWS
 from graings.training.journal import EvaluationPoint, Journal
-from graings.training.lost import FEWEST_STEPS, LOOK_AT, LOST_WINDOW, MANY, lost_share
+from graings.training.lost import FEWEST_STEPS, LOOK_AT, LOST_WINDOWS, MANY, lost_share
 from graings.training.pace import Clock, Rate, evaluation_marks
 from graings.training.stiffness import Stiffness, subpixel_share
 from graings.training.time_window import TimeWindow
@@ -126,7 +126,6 @@ class TrainingRun:
         model, state = load_training(folder)
         with _intact(model.path):
             attempt = Attempt.of(state.facts)
-            attempt.config(config)
         run = cls(folder, data, config, threads, clock, attempt)
         with _intact(model.path):
             run._trainer.load(model.scene, state.tensors, state.facts["trainer"])
@@ -142,7 +141,7 @@ class TrainingRun:
     @property
     def iterations(self) -> int:
         """Iterations wanted."""
-        return self.config.iterations
+        return self._attempt.began + self.config.iterations
 
     @property
     def metrics_path(self) -> Path:
@@ -161,7 +160,6 @@ class TrainingRun:
         if self.iteration >= self.iterations and not self._is_complete():
             # Interrupted between the last step and the last file: only the end is left to do.
             self._finish()
-        due = evaluation_marks(self.config)
         rate = Rate()
         while self.iteration < self.iterations:
             step = self._trainer.step()
@@ -172,8 +170,9 @@ class TrainingRun:
             last = step.iteration == self.iterations
             saving = step.iteration % self.config.evaluation.checkpoint_every == 0
             # Nobody looks at a scene, or saves it, that is not finite.
-            found = self._check() if last or saving or step.iteration in due else ()
-            point = self._evaluate() if step.iteration in due and not last else None
+            due = step.iteration in evaluation_marks(self.config, self.iterations)
+            found = self._check() if last or saving or due else ()
+            point = self._evaluate() if due and not last else None
             found += self._look_for_lost()
             if saving and not last:
                 self._save()
@@ -207,8 +206,8 @@ class TrainingRun:
     def _look_for_lost(self) -> tuple[str, ...]:
         """Once, early enough: begin again in a part of the clip where training has lost what moves in all of it.
 
-        What is lost once is not found again. The iterations are spent. A window that was asked for, or that the masks
-        asked for, stays.
+        What is lost once is not found again. The new attempt takes as many iterations as the run was to have: what
+        fewer leave of a draft is worth 5 dB. A window that was asked for, or that the masks asked for, stays.
         """
         trainer, mark = self._trainer, self.applied.scaled(LOOK_AT)
         chosen = self.applied.time_window is not None or trainer.window.share(1) < 1
@@ -216,15 +215,15 @@ class TrainingRun:
             return ()
         if not trainer.scene.temporal or len(self.capture.times) < 2:
             return ()
-        part = TimeWindow(self.applied, [frame.time for frame in self.capture.train], LOST_WINDOW)
-        if sum(part.has(view, 0) for view in range(len(self.capture.train))) < MIN_VIEWS:
+        parts = [share for share in LOST_WINDOWS if self._views_within(share) >= MIN_VIEWS]
+        if not parts:
             return ()
         started, computed = time.perf_counter(), time.process_time()
         frames = subset(self.capture.train, CARVING_VIEWS)
         share = lost_share(trainer.scene, frames, self.images, trainer.background)
         said: tuple[str, ...] = ()
         if share > MANY:
-            self._begin(Attempt(self.iteration, LOST_WINDOW))
+            self._begin(Attempt(self.iteration, parts[0]))
             said = (
                 f"time_window: begins again, in the middle of the clip: in {share:.0%} of the views something large "
                 "that moves was lost. `time_window=1` keeps what there is.",
@@ -232,6 +231,11 @@ class TrainingRun:
             self._journal.note(self.iteration, said)
         self._journal.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
         return said
+
+    def _views_within(self, share: float) -> int:
+        """Training views in the middle `share` of the clip."""
+        window = TimeWindow(self.applied, [frame.time for frame in self.capture.train], share)
+        return sum(window.has(view, 0) for view in range(len(self.capture.train)))
 
     def _save(self, *, finished: bool = False, best: bool = False, instead_of_later: bool = False) -> Path:
         started = time.perf_counter()
