@@ -278,7 +278,8 @@ class TrainConfig(Part):
         gt=0,
         le=1,
         description="Share of the clip, around its middle, whose views training begins with; 1 takes all. null: the "
-        "widest in which what the masks show stays in place, which is all of most clips.",
+        "widest in which what the masks show stays in place, which is all of most clips, and less, from the start once "
+        "more, where training loses something all the same.",
     )
     time_window_until: int = Field(
         7_500, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."
