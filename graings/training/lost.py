@@ -17,14 +17,20 @@ from torch.nn import functional
 
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
+from graings.config import TrainConfig
 from graings.render import render
 from graings.scene.scene import Scene
+from graings.training.carving import MIN_VIEWS
+from graings.training.time_window import TimeWindow
 
 # Mark of the 30 000 schedule at which to look: later than the slowest of the clips looked at had found what they show.
 LOOK_AT: Final = 12_500
 
 # After fewer steps even what stays in place may not have been found; a run whose mark comes earlier is not looked at.
 FEWEST_STEPS: Final = 400
+
+# Training views to look at.
+VIEWS: Final = 60
 
 # Above this share of the views something is lost. Of seven clips that train well none has more than a thirtieth; three
 # in which balls are lost have 0.5 and more.
@@ -38,6 +44,21 @@ LOST_WINDOWS: Final = (0.1, 0.25)
 CELLS: Final = 50
 BLOCK: Final = 3
 WRONG: Final = 0.3
+
+
+def look_at(config: TrainConfig) -> int | None:
+    """The iteration of an attempt after which to look, None where it has too few."""
+    mark = config.scaled(LOOK_AT)
+    return mark if mark >= FEWEST_STEPS else None
+
+
+def part_of_clip(config: TrainConfig, times: Sequence[float]) -> float | None:
+    """The share of the clip, training views at `times` in [0, 1], to begin again with; None where there is none with enough views."""
+    for share in LOST_WINDOWS:
+        window = TimeWindow(config, times, share)
+        if MIN_VIEWS <= sum(window.has(view, 0) for view in range(len(times))) < len(times):
+            return share
+    return None
 
 
 def lost_share(scene: Scene, frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> float:

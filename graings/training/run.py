@@ -37,14 +37,11 @@ from graings.plan import Plan, make_plan
 from graings.report import read_metrics
 from graings.run_folder import MODEL_FILE, RECORD_FILE, read_record, sole_trainer
 from graings.threads import use_threads
+from graings.training import lost
 from graings.training.attempt import Attempt
-from graings.training.carving import MIN_VIEWS
-from graings.training.initialize import CARVING_VIEWS
 from graings.training.journal import EvaluationPoint, Journal
-from graings.training.lost import FEWEST_STEPS, LOOK_AT, LOST_WINDOWS, MANY, lost_share
 from graings.training.pace import Clock, Rate, evaluation_marks
 from graings.training.stiffness import Stiffness, subpixel_share
-from graings.training.time_window import TimeWindow
 from graings.training.trainer import StepReport, Trainer
 
 LOG = logging.getLogger(__name__)
@@ -209,21 +206,19 @@ class TrainingRun:
         What is lost once is not found again. The new attempt takes as many iterations as the run was to have: what
         fewer leave of a draft is worth 5 dB. A window that was asked for, or that the masks asked for, stays.
         """
-        trainer, mark = self._trainer, self.applied.scaled(LOOK_AT)
+        trainer = self._trainer
         chosen = self.applied.time_window is not None or trainer.window.share(1) < 1
-        if self.iteration != mark or mark < FEWEST_STEPS or self._attempt.began > 0 or chosen:
+        if self.iteration != lost.look_at(self.applied) or self._attempt.began > 0 or chosen:
             return ()
-        if not trainer.scene.temporal or len(self.capture.times) < 2:
-            return ()
-        parts = [share for share in LOST_WINDOWS if self._views_within(share) >= MIN_VIEWS]
-        if not parts:
+        part = lost.part_of_clip(self.applied, [frame.time for frame in self.capture.train])
+        if part is None or not trainer.scene.temporal:
             return ()
         started, computed = time.perf_counter(), time.process_time()
-        frames = subset(self.capture.train, CARVING_VIEWS)
-        share = lost_share(trainer.scene, frames, self.images, trainer.background)
+        frames = subset(self.capture.train, lost.VIEWS)
+        share = lost.lost_share(trainer.scene, frames, self.images, trainer.background)
         said: tuple[str, ...] = ()
-        if share > MANY:
-            self._begin(Attempt(self.iteration, parts[0]))
+        if share > lost.MANY:
+            self._begin(Attempt(self.iteration, part))
             said = (
                 f"time_window: begins again, in the middle of the clip: in {share:.0%} of the views something large "
                 "that moves was lost. `time_window=1` keeps what there is.",
@@ -231,11 +226,6 @@ class TrainingRun:
             self._journal.note(self.iteration, said)
         self._journal.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
         return said
-
-    def _views_within(self, share: float) -> int:
-        """Training views in the middle `share` of the clip."""
-        window = TimeWindow(self.applied, [frame.time for frame in self.capture.train], share)
-        return sum(window.has(view, 0) for view in range(len(self.capture.train)))
 
     def _save(self, *, finished: bool = False, best: bool = False, instead_of_later: bool = False) -> Path:
         started = time.perf_counter()

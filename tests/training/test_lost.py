@@ -16,7 +16,7 @@ from graings.capture.synthetic import Body, SyntheticScene, write_synthetic
 from graings.checkpoint import load_model, load_state, newest_checkpoint
 from graings.config import TrainConfig, make_config
 from graings.training.attempt import Attempt
-from graings.training.lost import BLOCK, CELLS, FEWEST_STEPS, LOOK_AT, LOST_WINDOWS, WRONG, has_lost
+from graings.training.lost import BLOCK, CELLS, FEWEST_STEPS, LOOK_AT, LOST_WINDOWS, WRONG, has_lost, part_of_clip
 from graings.training.run import RunReport, TrainingRun
 from tests.training.micro import micro_config
 
@@ -156,3 +156,10 @@ def test_an_attempt_has_a_window_of_its_own() -> None:
     other = Attempt(400, 0.25).config(config)
     assert (other.iterations, other.time_window) == (ITERATIONS, 0.25)
     assert Attempt.of({}) == Attempt()
+
+
+def test_the_narrowest_part_with_enough_views_is_begun_with() -> None:
+    config = small()
+    for count, part in ((200, 0.1), (60, 0.25), (20, None)):
+        assert part_of_clip(config, np.linspace(0, 1, count).tolist()) == part
+    assert part_of_clip(config, [0.0] * 100) is None  # a still
