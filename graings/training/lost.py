@@ -53,7 +53,7 @@ def look_at(config: TrainConfig) -> int | None:
 
 
 def part_of_clip(config: TrainConfig, times: Sequence[float]) -> float | None:
-    """The share of the clip, training views at `times` in [0, 1], to begin again with; None where there is none with enough views."""
+    """The share of the clip to begin again with, None where none has enough views; those of training are at `times`."""
     for share in LOST_WINDOWS:
         window = TimeWindow(config, times, share)
         if MIN_VIEWS <= sum(window.has(view, 0) for view in range(len(times))) < len(times):
