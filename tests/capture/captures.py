@@ -85,6 +85,19 @@ def write_dnerf(folder: Path, times: list[float] | None = None, *, radius: float
     return folder
 
 
+def write_single(folder: Path, count: int = 20, *, frame: dict[str, Any] | None = None, **top: Any) -> Path:
+    """A sound capture of `count` images of 64x40 px on a ring, in one transforms.json whose frames are out of order."""
+    lens = {"fl_x": 60.0, "fl_y": 62.0, "cx": 33.0, "cy": 19.0, "w": 64, "h": 40}
+    frames = []
+    for index in range(count):
+        name = f"images/frame_{index:05d}.png"
+        write_image(folder / name, pixels(40, 64, 3, seed=index))
+        frames.append(entry(orbit(index, count), name, **(frame or {})))
+    document = {**lens, "camera_model": "OPENCV", **top, "frames": frames[::-1]}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
 def write_walled(folder: Path, cameras: Sequence[Camera]) -> Path:
     """Opaque photographs of a painted floor (z = 0) that fills them, at different times; every eighth is held out."""
     paint = np.random.default_rng(0).random((64, 64, 3))

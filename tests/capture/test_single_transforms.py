@@ -15,23 +15,7 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
-from tests.capture.captures import entry, orbit, pixels, write_colmap, write_dnerf, write_image
-
-SIZE = (64, 40)
-LENS = {"fl_x": 60.0, "fl_y": 62.0, "cx": 33.0, "cy": 19.0, "w": 64, "h": 40}
-
-
-def write_single(folder: Path, count: int = 20, *, frame: dict[str, Any] | None = None, **top: Any) -> Path:
-    """A sound capture of `count` images on a ring, in one file whose frames are out of order."""
-    folder.mkdir(parents=True, exist_ok=True)
-    frames = []
-    for index in range(count):
-        name = f"images/frame_{index:05d}.png"
-        write_image(folder / name, pixels(SIZE[1], SIZE[0], 3, seed=index))
-        frames.append(entry(orbit(index, count), name, **(frame or {})))
-    document = {**LENS, "camera_model": "OPENCV", **top, "frames": frames[::-1]}
-    (folder / "transforms.json").write_text(json.dumps(document))
-    return folder
+from tests.capture.captures import orbit, pixels, write_colmap, write_dnerf, write_image, write_single
 
 
 def numbers(capture: Any, split: str) -> list[int]:
@@ -94,7 +78,7 @@ def test_times_come_from_names_where_asked_for_and_none_is_given(tmp_path: Path)
 def test_distorted_lenses_are_undistorted_as_pycolmap_does(
     tmp_path: Path, model: str, keys: dict[str, Any], params: tuple[float, ...]
 ) -> None:
-    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    y, x = np.mgrid[:40, :64]
     smooth = np.stack([x * 3.5, y * 6.0, 255 - x - y], axis=2).astype(np.uint8)
     write_single(tmp_path, 2, **keys)
     write_image(tmp_path / "images/frame_00001.png", smooth)

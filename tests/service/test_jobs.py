@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from jobs.engine import Engine
 from jobs.store import JobFolder
 from service.app import create_app
 from service.settings import Settings
+from tests.capture.captures import write_single
 
 
 def problem(answer: Any, status: int) -> dict[str, Any]:
@@ -48,6 +50,18 @@ def test_a_form_with_a_file_and_options_does_the_same(client: TestClient, archiv
     answer = client.post("/jobs", params={"config": '{"iterations": 60}'}, files={"capture": archive}, data=form)
     assert answer.status_code == 202, answer.text
     assert (answer.json()["config"]["iterations"], answer.json()["config"]["preset"]) == (70, "paper")
+
+
+def test_a_lone_transforms_file_with_its_points_becomes_a_job(client: TestClient, tmp_path: Path) -> None:
+    folder = write_single(
+        tmp_path / "scan", 10, ply_file_path="points.ply", k1=0.01, frame={"mask_path": "masks/0.png"}
+    )
+    place = "".join(f"property float {axis}\n" for axis in "xyz")
+    header = f"ply\nformat ascii 1.0\nelement vertex 2\n{place}end_header\n"
+    (folder / "points.ply").write_text(header + "0 0 0\n0.1 0 0\n")
+    archive = Path(shutil.make_archive(str(tmp_path / "scan"), "zip", tmp_path, "scan"))
+    answer = client.post("/jobs", params={"preset": "draft"}, content=archive.read_bytes())
+    assert (answer.status_code, answer.json()["state"]) == (202, "queued"), answer.text
 
 
 @pytest.mark.parametrize(
