@@ -213,6 +213,26 @@ def prune(scaffold: Scaffold, statistics: DensityStatistics, config: DensityConf
     return keep
 
 
+def thinned(
+    scaffold: Scaffold, statistics: DensityStatistics, most: int, generator: torch.Generator
+) -> tuple[Bool[Tensor, " anchor"], Float[Tensor, " anchor"]]:
+    """Which `most` of more anchors stay, and what is added to the log-scale of each so that no gaps are left.
+
+    Half of those that stay are where the pictures ask for more; the others are drawn at random from all the rest, a
+    floor or a wall, and each takes the area of those that go beside it.
+    """
+    asked = (statistics.gradient / statistics.drawn.clamp_min(1)).amax(dim=-1)
+    order = torch.argsort(asked, descending=True, stable=True)
+    wanted, rest = order[: most // 2], order[most // 2 :]
+    stay = rest[torch.randperm(len(rest), generator=generator)[: most - len(wanted)]]
+    keep = torch.zeros(scaffold.count, dtype=torch.bool)
+    keep[wanted] = True
+    keep[stay] = True
+    wider = scaffold.log_scales.new_zeros(scaffold.count)
+    wider[stay] = 0.5 * math.log(len(rest) / len(stay))  # they cover surfaces
+    return keep, wider
+
+
 def _contains(occupied: Int64[Tensor, "cell 3"], cells: Int64[Tensor, "query 3"]) -> Bool[Tensor, " query"]:
     """Which of `cells` are among `occupied` (both without duplicates)."""
     _, group, counts = torch.unique(torch.cat([occupied, cells]), dim=0, return_inverse=True, return_counts=True)

@@ -22,6 +22,11 @@ from graings.training.optimizer import Optimizer
 # With more of the anchors' budget taken than this, growth first removes those that show nothing.
 ROOM = 0.9
 
+# Where more anchors stand than may, and nine tenths of them have been seen often enough for what shows nothing to have
+# gone, those that are left are thinned to this share of the budget. Nothing could be born for the rest of the run.
+JUDGED = 0.9
+THINNED = 0.5
+
 
 class DensityControl:
     """Grows and prunes one scene. `voxel_size` is that of the finest cells, normalised."""
@@ -54,7 +59,10 @@ class DensityControl:
         events: list[str] = []
         # Anchors that show nothing would keep others from growing for good: what is not drawn does not come back.
         if scene.scaffold.count > ROOM * self.config.max_anchors:
+            judged = float((self.statistics.visits > self.config.prune_visits).double().mean())
             events = self.prune(scene, optimizer)
+            if judged > JUDGED and scene.scaffold.count > self.config.max_anchors:
+                events += self._thin(scene, optimizer, generator)
         growth = density.grow(
             scene.scaffold,
             self.statistics,
@@ -84,6 +92,16 @@ class DensityControl:
         optimizer.keep(keep)
         self.statistics.resize(keep=keep)
         return [f"pruned {removed} anchors"]
+
+    def _thin(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> list[str]:
+        """Make room where what stood from the first is more than may be; returns what happened, in words."""
+        count, most = scene.scaffold.count, max(2, int(THINNED * self.config.max_anchors))
+        keep, wider = density.thinned(scene.scaffold, self.statistics, most, generator)
+        with torch.no_grad():
+            scene.scaffold.log_scales.add_(wider.unsqueeze(-1))
+        optimizer.keep(keep)
+        self.statistics.resize(keep=keep)
+        return [f"thinned {count} anchors to {most}: the budget is for more than what lies flat"]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Statistics, and facts as JSON."""

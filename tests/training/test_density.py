@@ -8,7 +8,7 @@ import torch
 
 from graings.config import DensityConfig, TrainConfig
 from graings.scene.scaffold import Scaffold
-from graings.training.density import DensityStatistics, grow, newborn_offsets, prune, voxel_keys
+from graings.training.density import DensityStatistics, grow, newborn_offsets, prune, thinned, voxel_keys
 from graings.training.density_control import DensityControl
 from graings.training.optimizer import Optimizer
 from tests.models import EYE, tiny_scene
@@ -103,6 +103,25 @@ def test_the_budget_keeps_the_largest_gradients() -> None:
     assert not free.capped
     mean = tight.rows["anchors"].mean(0)
     assert torch.allclose(mean, scaffold.anchors[-20:].mean(0), atol=0.3)
+
+
+def test_thinning_keeps_what_asks_for_more_and_widens_the_rest() -> None:
+    scaffold = tiny_scene(anchors=200).scaffold
+    statistics = _busy(scaffold, gradient=0.1)
+    asking = torch.tensor([3, 50, 170, 199])
+    statistics.gradient[asking, 1] *= 5  # one child is enough
+    statistics.drawn[7] = 0  # never seen
+    statistics.gradient[7] = 0
+    keep, wider = thinned(scaffold, statistics, 40, torch.Generator().manual_seed(0))
+    assert int(keep.sum()) == 40
+    assert keep[asking].all()
+    assert torch.count_nonzero(wider[asking]) == 0
+    widened = wider > 0
+    assert (int(widened.sum()), bool(keep[widened].all())) == (20, True)
+    # A hundred and eighty are replaced by twenty, so that their area is that of all.
+    assert torch.allclose(wider[widened].mul(2).exp().sum(), torch.tensor(180.0))
+    again = thinned(scaffold, statistics, 40, torch.Generator().manual_seed(0))
+    assert torch.equal(keep, again[0])
 
 
 def test_newborns_are_faint_or_inherit_when_asked() -> None:

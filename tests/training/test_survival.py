@@ -292,6 +292,24 @@ def test_anchors_that_show_nothing_make_room_for_growth(micro: Path) -> None:
     assert len(uids) <= 60
 
 
+def test_more_than_the_budget_from_the_first_step_on_is_thinned(micro: Path) -> None:
+    growing = {"density.statistics_from": 0, "density.grow_from": 0, "density.grow_until": 30_000}
+    eager = {"density.grow_every": 10, "density.prune_visits": 15}
+    found = {}
+    for most in (40, 20_000):
+        trainer = micro_trainer(micro, iterations=400, **growing, **eager, **{"density.max_anchors": most})
+        assert trainer.scene.scaffold.count > 40, "as a floor that nobody looks at has"
+        reports = steps(trainer, 400)
+        found[most] = quality(trainer)
+        assert len(said(reports, "thinned")) == (1 if most == 40 else 0)
+        assert trainer.scene.scaffold.count <= most
+        if most == 40:
+            after = next(i for i, report in enumerate(reports) if said([report], "thinned"))
+            assert said(reports[after + 1 :], "grew"), "there is room again"
+    print(f"with 40 anchors {found[40]:.2f} dB, with as many as it likes {found[20_000]:.2f} dB")
+    assert found[40] > found[20_000] - 3
+
+
 def test_a_larger_scene_costs_more_of_the_budget() -> None:
     small, large = micro_config().scene, micro_config(**{"scene.children": 10, "scene.deform_width": 256}).scene
     assert bytes_per_anchor(large, 1) > 3 * bytes_per_anchor(small, 1)
