@@ -114,8 +114,11 @@ def first_points(capture: Capture, images: ImageStore, config: TrainConfig, stre
     """
     generator = streams["init.points"]
     window, most = config.time_window or 1.0, config.init.max_points
+    # What lies on surfaces stays: more of it than may grow would leave no room for what moves. Carved points lie inside
+    # of things, and most of them soon go.
+    lasting = min(most, most_anchors(config))
     if capture.points is not None:
-        return FirstPoints(_thinned(capture.points.positions, most, generator), window)
+        return FirstPoints(_thinned(capture.points.positions, lasting, generator), window)
     half = content_half_size(capture)
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
     if config.init.carve_vote == 0:
@@ -127,8 +130,7 @@ def first_points(capture: Capture, images: ImageStore, config: TrainConfig, stre
     if np.mean([view.mask.mean() for view in whole]) > FILLED:
         places, notes = _agreed(capture, images)
         if places is not None:
-            # More than may grow would leave no room for what moves. Carved points lie inside of things and soon go.
-            return FirstPoints(_thinned(places, min(most, most_anchors(config)), generator), window, notes)
+            return FirstPoints(_thinned(places, lasting, generator), window, notes)
     carved, window = _carved(cube, order, whole, capture, images, config) or (cube, window)
     return FirstPoints(_thinned(carved, most, generator), window, notes)
 

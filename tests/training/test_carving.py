@@ -83,6 +83,10 @@ def test_no_more_points_are_first_anchors_than_may_be(flight: Path) -> None:
         )
         assert len(few) == 50
         assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in points.tolist()}
+        # Points of a cloud lie on surfaces and stay: no more than may grow. Carved ones lie inside of things and go.
+        tight = _draft(**{"density.max_anchors": 100})
+        most = first_points(capture, ImageStore(WHITE), tight, Streams(0)).positions
+        assert len(most) == (100 if capture is cloud else every)
 
 
 def test_a_clip_in_which_things_stay_in_place_begins_as_a_whole(tmp_path: Path) -> None:
