@@ -131,7 +131,10 @@ class InitConfig(Part):
         "pairs of them agree on are taken instead. 0 leaves random points as they are.",
     )
     max_points: int = Field(
-        20_000, ge=16, description="At most this many points become first anchors, wherever they come from."
+        20_000,
+        ge=16,
+        description="At most this many points become first anchors, wherever they come from; of a cloud's, or those that "
+        "pictures agree on, no more than `density.max_anchors` either.",
     )
     voxel_size: float | None = Field(
         None, ge=1e-9, description="Finest anchor cell, normalised; null: 0.7 px of the finer training views."

@@ -219,7 +219,7 @@ def thinned(
     """Which `most` of more anchors stay, and what is added to the log-scale of each so that no gaps are left.
 
     Half of those that stay are where the pictures ask for more; the others are drawn at random from all the rest, a
-    floor or a wall, and each takes the area of those that go beside it.
+    floor or a wall, and each takes the area of those that go beside it. Ours: the paper knows no budget.
     """
     asked = (statistics.gradient / statistics.drawn.clamp_min(1)).amax(dim=-1)
     order = torch.argsort(asked, descending=True, stable=True)

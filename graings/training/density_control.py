@@ -101,7 +101,7 @@ class DensityControl:
             scene.scaffold.log_scales.add_(wider.unsqueeze(-1))
         optimizer.keep(keep)
         self.statistics.resize(keep=keep)
-        return [f"thinned {count} anchors to {most}: the budget is for more than what lies flat"]
+        return [f"thinned {count} anchors to {most}: more stood from the first than the budget holds"]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Statistics, and facts as JSON."""
