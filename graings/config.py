@@ -133,8 +133,8 @@ class InitConfig(Part):
     max_points: int = Field(
         20_000,
         ge=16,
-        description="At most this many points become first anchors, wherever they come from; of a cloud's, or those that "
-        "pictures agree on, no more than `density.max_anchors` either.",
+        description="At most this many points become first anchors, wherever they come from; of a cloud's, or those "
+        "that pictures agree on, no more than `density.max_anchors` either.",
     )
     voxel_size: float | None = Field(
         None, ge=1e-9, description="Finest anchor cell, normalised; null: 0.7 px of the finer training views."
