@@ -34,6 +34,7 @@ SHAPE_BEFORE: Final[dict[str, Any]] = {
     "head_width": 32,
     "reflection": False,
     "blur": 0.3,
+    "residual_degree": 0,
 }
 
 
@@ -94,6 +95,13 @@ class SceneConfig(Part):
     stop_gradient: bool = Field(True, description="Detach the canonical position before DeformNet (Eq. 7).")
     single_mlp: bool = Field(False, description="Ablation: one network for canonical and temporal geometry.")
     residual: bool = Field(True, description="Temporal appearance residual (Eq. 12).")
+    residual_degree: int = Field(
+        2,
+        ge=0,
+        le=3,
+        description="Degree up to which the residual of colour sees spherical harmonics of the viewing direction; 0 is "
+        "Eq. 12, which sees none.",
+    )
     residual_stop_gradient: bool = Field(True, description="Detach the anchor feature before the residual field.")
     canonical: bool = Field(True, description="Ablation when off: no canonical geometry branch and no warm-up.")
     direction_degree: int = Field(

@@ -33,7 +33,8 @@ def tiny_scene(
     scene = Scene(settings, scaffold, extent=1.0, sampling=SAMPLING, initial_opacity=0.3)
     if awake:
         with torch.no_grad():
-            for module in (scene.deformation, scene.residual):
+            seeing = None if scene.residual is None else scene.residual.seeing
+            for module in (scene.deformation, scene.residual, seeing):
                 if module is not None:
                     module.out.weight.normal_(std=0.1)
                     module.out.bias.normal_(std=0.1)

@@ -83,30 +83,50 @@ class CanonicalAppearance(nn.Module):
         return highest
 
 
-class ResidualField(nn.Module):
-    """F_res: (f_a, gamma(t)) -> (Delta c, Delta o) per child slot, Eq. 12; zero at birth.
+class TemporalHead(nn.Module):
+    """One hidden layer, which the encoded time enters once for all rows; its answer is zero at birth."""
 
-    What `forward` gives is still to be bounded by `bounded`: few slots are drawn, and only they need all of it.
-    """
-
-    def __init__(self, config: SceneConfig) -> None:
+    def __init__(self, config: SceneConfig, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.scale = config.residual_scale
-        self.time_frequencies = config.time_frequencies
-        self.from_feature = nn.Linear(config.feature_dim, config.head_width)
+        self.from_feature = nn.Linear(inputs, config.head_width)
         self.from_time = nn.Linear(encoding_width(1, config.time_frequencies), config.head_width, bias=False)
-        self.out = nn.Linear(config.head_width, 4 * config.children)
+        self.out = nn.Linear(config.head_width, outputs)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
+    def answer(self, rows: Float[Tensor, "row input"], moment: Float[Tensor, " time"]) -> Float[Tensor, "row output"]:
+        """For `rows` at the time whose encoding is `moment`."""
+        biases = [self.from_feature.bias + self.from_time(moment), self.out.bias]
+        return perceptron(rows, [self.from_feature.weight, self.out.weight], biases)
+
+
+class ResidualField(TemporalHead):
+    """F_res: (f_a, gamma(t)) -> (Delta c, Delta o) per child slot, Eq. 12; zero at birth.
+
+    With `residual_degree` a head of its own gives Delta c and is told the viewing direction too, as spherical harmonics
+    up to that degree: what shines, or lets light through, changes in time by another amount from every side. Delta o
+    never is (decision 8). What `forward` gives is still to be bounded by `bounded`: few slots are drawn, and only they
+    need all of it.
+    """
+
+    def __init__(self, config: SceneConfig) -> None:
+        seen = direction_width(config.residual_degree)
+        super().__init__(config, config.feature_dim, config.children * (1 if seen else 4))
+        self.scale = config.residual_scale
+        self.time_frequencies = config.time_frequencies
+        self.degree = config.residual_degree
+        self.seeing = TemporalHead(config, config.feature_dim + seen, 3 * config.children) if seen else None
+
     def forward(
-        self, features: Float[Tensor, "anchor feature"], time: Float[Tensor, 1]
+        self, features: Float[Tensor, "anchor feature"], time: Float[Tensor, 1], directions: Float[Tensor, "anchor 3"]
     ) -> Float[Tensor, "anchor child 4"]:
         """(Delta c, Delta o) of every slot at `time` in [0, 1], unbounded."""
-        moment = self.from_time(frequency_encoding(time, self.time_frequencies))
-        biases = [self.from_feature.bias + moment, self.out.bias]
-        change = perceptron(features, [self.from_feature.weight, self.out.weight], biases)
-        return change.unflatten(-1, (-1, 4))
+        moment = frequency_encoding(time, self.time_frequencies)
+        blind = self.answer(features, moment)
+        if self.seeing is None:
+            return blind.unflatten(-1, (-1, 4))
+        rows = torch.cat([features, direction_encoding(directions, self.degree)], dim=-1)
+        return torch.cat([self.seeing.answer(rows, moment).unflatten(-1, (-1, 3)), blind.unsqueeze(-1)], dim=-1)
 
     def bounded(self, raw: Float[Tensor, "*rows"]) -> Float[Tensor, "*rows"]:
         """`raw` within (-eta, eta)."""

@@ -118,9 +118,13 @@ class Scene(nn.Module):
         features = scaffold.features.index_select(0, awake)
         source = features.detach() if config.residual_stop_gradient else features
         scores = [score.index_select(0, awake) for score in lasting]
+        directions = [towards.index_select(0, awake) for towards in directions]
         changes: list[Tensor | None] = [None] * len(views)
         if residual is not None:
-            changes = [residual(source, torch.tensor([time], dtype=features.dtype)) for time in times]
+            changes = [
+                residual(source, torch.tensor([time], dtype=features.dtype), towards)
+                for time, towards in zip(times, directions, strict=True)
+            ]
             scores = [
                 score if change is None else score + residual.bounded(change[..., 3])
                 for score, change in zip(scores, changes, strict=True)
@@ -136,7 +140,7 @@ class Scene(nn.Module):
         answers = self._answers(drawn, children, times)
         every = zip(lasting, scores, changes, directions, answers, strict=True)
         for unchanged, score, change, towards, (canonical, raw) in every:
-            colors = self.appearance.colors(features, towards.index_select(0, awake), places)
+            colors = self.appearance.colors(features, towards, places)
             drawn_change = None
             if residual is not None and change is not None:
                 drawn_change = residual.bounded(change.flatten(0, 1).index_select(0, places))

@@ -35,14 +35,12 @@ def bytes_per_anchor(config: SceneConfig, views: int) -> int:
     fixed = 20 * (1 + COPIES) + statistics * 4
     static = 3 + k + config.static_width
     deform = encoding_width(3, config.position_frequencies) + config.deform_width * config.deform_depth
-    seen = 2 if config.reflection else 1
-    heads = (
-        config.feature_dim
-        + seen * direction_width(config.direction_degree)
-        + 3 * config.head_width
-        + 8 * k
-        + config.static_width
-    )
+    seen = (2 if config.reflection else 1) * direction_width(config.direction_degree)
+    inputs, hidden = config.feature_dim + seen, 3 * config.head_width
+    if config.residual_degree > 0:  # a fourth head, with inputs of its own
+        inputs += config.feature_dim + direction_width(config.residual_degree)
+        hidden += config.head_width
+    heads = inputs + hidden + 8 * k + config.static_width
     networks = static + deform
     if config.single_mlp or config.deform_time == "input":  # time goes through the hidden layers
         networks *= views

@@ -24,7 +24,9 @@ def scene_of(**config: Any) -> Scene:
         logits = scene.appearance.opacity_logits(scene.scaffold.features, scene.directions(EYE))
         scene.scaffold.opacity_offsets.copy_(brightest - logits.amax(-1))
         if scene.residual is not None:
-            scene.residual.out.weight.mul_(1e3)
+            for head in (scene.residual, scene.residual.seeing):
+                if head is not None:
+                    head.out.weight.mul_(1e3)
     return scene
 
 
@@ -41,12 +43,13 @@ def everything(scene: Scene) -> tuple[Tensor, Tensor]:
     slots = torch.arange(scaffold.count * scaffold.slots)
     scores, colors = lasting(scene), scene.appearance.colors(scaffold.features, scene.directions(EYE), slots)
     if scene.residual is not None:
-        change = ETA * torch.tanh(scene.residual(scaffold.features, torch.tensor([TIME], dtype=torch.float64)))
+        moment = torch.tensor([TIME], dtype=torch.float64)
+        change = ETA * torch.tanh(scene.residual(scaffold.features, moment, scene.directions(EYE)))
         scores, colors = scores + change[..., 3], (colors + change[..., :3].flatten(0, 1)).clamp(0, 1)
     return scores.detach(), colors.detach()
 
 
-@pytest.mark.parametrize("config", [{}, {"residual": False}, {"opacity_view": True}], ids=str)
+@pytest.mark.parametrize("config", [{}, {"residual": False}, {"residual_degree": 0}, {"opacity_view": True}], ids=str)
 def test_what_is_drawn_is_what_asking_every_anchor_gives(config: dict[str, Any]) -> None:
     scene = scene_of(**config)
     scores, colors = everything(scene)

@@ -96,10 +96,23 @@ def test_residual_is_bounded_by_eta() -> None:
     scene = tiny_scene(residual_scale=0.1)
     with torch.no_grad():
         scene.residual.out.weight.mul_(1e3)
+        scene.residual.seeing.out.weight.mul_(1e3)
     composition = scene.compose(EYE, 0.4)
     assert float(composition.residual.detach().abs().max()) <= 0.1 + 1e-7
     assert float(composition.gaussians.colors.detach().amin()) >= 0.0
     assert float(composition.gaussians.colors.detach().amax()) <= 1.0
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_residual_of_colour_sees_the_view_as_configured_and_that_of_opacity_never(degree: int) -> None:
+    scene = tiny_scene(residual_degree=degree)
+    here, there = (scene.compose(eye, 0.4) for eye in (EYE, [-x for x in EYE]))
+    assert torch.equal(here.children, there.children)
+    assert here.residual is not None
+    assert there.residual is not None
+    differs = (here.residual - there.residual).detach().abs().amax(0)
+    assert float(differs[3]) == 0.0
+    assert float(differs[:3].amax()) > 1e-3 if degree > 0 else float(differs[:3].amax()) == 0.0
 
 
 def test_each_child_moves_by_itself_and_broadcast_moves_anchors_whole() -> None:
