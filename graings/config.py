@@ -130,13 +130,14 @@ class SceneConfig(Part):
 class InitConfig(Part):
     """The first anchors. Owner: `graings.training.initialize`."""
 
-    points: int = Field(60_000, ge=16, le=2_000_000, description="Random points where the capture has no cloud.")
+    points: int = Field(240_000, ge=16, le=2_000_000, description="Random points where the capture has no cloud.")
     carve_vote: float = Field(
         0.6,
         ge=0,
         le=1,
-        description="Share of views whose mask a random point must hit to stay. Where pictures are filled, places that "
-        "pairs of them agree on are taken instead. 0 leaves random points as they are.",
+        description="Least share of views whose mask a random point must hit to stay; where more agree on enough, more "
+        "must. Where pictures are filled, places that pairs of them agree on are taken instead. 0 leaves random points "
+        "as they are.",
     )
     max_points: int = Field(
         20_000,

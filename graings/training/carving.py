@@ -20,6 +20,9 @@ from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.errors import CaptureError
 
+# Shares of the views that are asked for before the configured one: what stands still meets the first.
+STRICTER: Final = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.65)
+
 # A mask is dilated by this many pixels, so that a thin moving part still counts as hit.
 MASK_MARGIN: Final = 2
 
@@ -72,17 +75,37 @@ def refuse_empty(views: Sequence[Masked]) -> None:
         )
 
 
-def carve(points: NDArray[np.float64], views: Sequence[Masked], vote: float) -> NDArray[np.float64]:
-    """Those of `points` [M, 3] on the dilated mask of at least a share `vote` of the views in which they lie."""
+def carve(points: NDArray[np.float64], views: Sequence[Masked], vote: float, cells: int) -> NDArray[np.float64]:
+    """Those of `points` [M, 3] that the images allow, as few as show what the images do.
+
+    Allowed is what lies on the dilated mask of at least a share `vote` of the views in which it lies. Where things move
+    that has to be a low one, and what stands still then has a fog about it, which most views see past: a plate seen
+    from above becomes two cones, base to base. So what nearly all views agree on comes first, and of what fewer do only
+    what `WORSE` of the views or more have no point for yet, in a picture whose longer side is `cells` long.
+    """
+    share = _votes(points, views)
+    points, share = points[share >= vote], share[share >= vote]
+    seen = [_Cells.of(points, view, cells) for view in views]
+    kept = share >= STRICTER[0]
+    for least in (*[level for level in STRICTER[1:] if level > vote], vote):
+        missed = np.zeros(len(points), np.int64)
+        for view in seen:
+            missed += view.at(~view.near(kept) & (view.shown > 0))
+        kept |= (share >= least) & (missed >= WORSE * len(views))
+    few: NDArray[np.float64] = points[kept]
+    return few if len(few) >= MIN_CARVED else points
+
+
+def _votes(points: NDArray[np.float64], views: Sequence[Masked]) -> NDArray[np.float64]:
+    """Of the views in which each of `points` lies, the share on whose dilated mask it does."""
     votes, seen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
         columns, rows, inside = _whole_pixels(points, view.frame.camera)
         mask = _dilated(view.mask, MASK_MARGIN)
         seen += inside
         votes[inside] += mask[rows[inside], columns[inside]]
-    # A point that no view sees is kept out too: nothing could ever train it.
-    kept: NDArray[np.float64] = points[(seen > 0) & (votes >= vote * np.maximum(seen, 1))]
-    return kept
+    # A point that no view sees is never allowed: nothing could train it.
+    return np.where(seen > 0, votes / np.maximum(seen, 1), -1.0)
 
 
 def coverage(points: NDArray[np.float64], views: Sequence[Masked], cells: int) -> float:
@@ -94,21 +117,45 @@ def coverage(points: NDArray[np.float64], views: Sequence[Masked], cells: int) -
     """
     shares = []
     for view in views:
-        camera = view.frame.camera
         if not view.mask.any():
             continue
+        seen = _Cells.of(points, view, cells)
+        pieces = _pieces(seen.shown > 0).ravel()
+        whole = np.bincount(pieces, seen.shown.ravel())
+        covered = np.bincount(pieces, np.where(seen.near(np.ones(len(points), np.bool_)), seen.shown, 0).ravel())
+        counts = whole >= min(SMALLEST_PIECE * whole.sum(), whole.max())
+        shares.append(float((covered[counts] / whole[counts]).min()))
+    return float(np.quantile(shares, WORSE)) if shares else 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """A view in cells of several pixels: how many of each, [H, W], show something, and which cell each point is in."""
+
+    shown: NDArray[np.int64]
+    cell: NDArray[np.int64]  # in rows, one after the other; of a point outside of the picture it says nothing
+    inside: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, points: NDArray[np.float64], view: Masked, cells: int) -> _Cells:
+        """The picture's longer side is `cells` long."""
+        camera = view.frame.camera
         size = max(1, -(-max(camera.width, camera.height) // cells))
         columns, rows, inside = _whole_pixels(points, camera)
         down, across = np.arange(0, camera.height, size), np.arange(0, camera.width, size)
         shown = np.add.reduceat(np.add.reduceat(view.mask, down, axis=0, dtype=np.int64), across, axis=1)
-        near = np.zeros(shown.shape, np.bool_)
-        near[rows[inside] // size, columns[inside] // size] = True
-        pieces = _pieces(shown > 0).ravel()
-        whole = np.bincount(pieces, shown.ravel())
-        covered = np.bincount(pieces, np.where(_dilated(near, 1), shown, 0).ravel())
-        counts = whole >= min(SMALLEST_PIECE * whole.sum(), whole.max())
-        shares.append(float((covered[counts] / whole[counts]).min()))
-    return float(np.quantile(shares, WORSE)) if shares else 1.0
+        return cls(shown, rows // size * len(across) + columns // size, inside)
+
+    def near(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Cells, [H, W], that have one of the `chosen` points in them or next to them."""
+        near = np.zeros(self.shown.size, np.bool_)
+        near[self.cell[self.inside & chosen]] = True
+        return _dilated(near.reshape(self.shown.shape), 1)
+
+    def at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Points that are in one of the `cells`, [H, W]."""
+        found: NDArray[np.bool_] = self.inside & cells.ravel()[self.cell]
+        return found
 
 
 def _whole_pixels(

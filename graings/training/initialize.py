@@ -184,7 +184,7 @@ def _carved(
         views = whole if share == 1 else _voters(capture, images, config, order, share)
         if config.time_window is None and share < 1 and len(views) < MIN_VIEWS:
             break
-        kept = carve(cube, views, config.init.carve_vote)
+        kept = carve(cube, views, config.init.carve_vote, cells)
         if len(kept) < MIN_CARVED:
             continue
         covered = coverage(kept, views, cells)

@@ -15,7 +15,7 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import Array, Body, SyntheticScene, write_synthetic
 from graings.config import TrainConfig, make_config
-from graings.training.carving import LEAST_COVERED, carve, coverage, masked
+from graings.training.carving import LEAST_COVERED, MIN_CARVED, carve, coverage, masked
 from graings.training.initialize import first_points
 from graings.training.streams import Streams
 from tests.capture.captures import without_alpha, write_image
@@ -55,7 +55,7 @@ def _ball(home: Array, swing: Array, radius: float) -> Body:
 
 def _draft(**options: object) -> TrainConfig:
     """A draft that begins with every point that the images allow."""
-    return make_config("draft", {"init.max_points": 60_000, **options})
+    return make_config("draft", {"init.points": 60_000, "init.max_points": 60_000, **options})
 
 
 def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
@@ -168,11 +168,31 @@ def test_pictures_of_the_background_alone_leave_all_points(flight: Path) -> None
 def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
     data = load_capture(flight)
     views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
-    kept = carve(_grid(), views, 0.6)
+    kept = carve(_grid(), views, 0.6, 50)
     assert 0 < len(kept) < 0.05 * len(_grid())
     assert coverage(kept, views, 50) > LEAST_COVERED
     assert coverage(kept + 5, views, 50) == 0
     assert coverage(kept[:1], views, 50) < coverage(kept, views, 50)
+
+
+def test_what_stands_still_has_no_fog_about_it_and_what_flies_beside_it_keeps_its_points(accompanied: Path) -> None:
+    data = load_capture(accompanied)
+    views = masked(data.train[16:32], ImageStore(WHITE), WHITE)
+    found = []
+    for points in (carve(_grid(), views, 0.6, 1), carve(_grid(), views, 0.6, 50)):  # every point is near to one cell
+        fog = np.linalg.norm(data.units.points_back(points), axis=-1) > 0.7  # the ball that stays has a radius of 0.5
+        found.append((int(fog.sum()), len(points), coverage(points, views, 50)))
+    (_, _, bare), (fog_left, count, covered) = found
+    assert bare < 0.8 < 0.95 < covered
+    assert fog_left < 0.1 * count
+
+
+def test_where_few_points_would_be_left_all_that_are_allowed_stay(flight: Path) -> None:
+    data = load_capture(flight)
+    views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
+    many, few = (len(carve(_grid()[::step], views, 0.6, 50)) * step for step in (1, 8))
+    assert few >= 8 * MIN_CARVED
+    assert few > 1.5 * many
 
 
 def test_a_small_thing_without_points_is_not_covered_by_a_large_one(accompanied: Path) -> None:
