@@ -59,7 +59,8 @@ class CaptureConfig(Part):
     test_every: int = Field(
         8,
         ge=2,
-        description="COLMAP, transforms.json: every n-th image by name is held out for test if there is no split.",
+        description="COLMAP, transforms.json: every n-th image by name is held out for test if there is no split; of "
+        "a rig of n or more cameras every n-th camera.",
     )
     cache_mb: int = Field(1024, ge=16, description="Memory for decoded images in MB.")
 

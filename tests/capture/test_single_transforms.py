@@ -15,7 +15,7 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
-from tests.capture.captures import orbit, pixels, write_colmap, write_dnerf, write_image, write_single
+from tests.capture.captures import opengl, orbit, pixels, write_colmap, write_dnerf, write_image, write_single
 
 
 def numbers(capture: Any, split: str) -> list[int]:
@@ -35,6 +35,42 @@ def test_images_are_held_out_by_name_as_of_a_colmap_model(tmp_path: Path) -> Non
         camera = frame.camera
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (60.0, 62.0, 33.0, 19.0), split
         assert frame.lens is None
+
+
+def rig(folder: Path, cameras: int, instants: int, **top: Any) -> Path:
+    """`cameras` that stay in place; image i is of camera i % cameras at time i // cameras."""
+    write_single(folder, cameras * instants, **top)
+    document = json.loads((folder / "transforms.json").read_text())
+    for frame in document["frames"]:
+        number = int(frame["file_path"][-9:-4])
+        frame["transform_matrix"] = opengl(orbit(number % cameras, cameras))
+        frame["time"] = number // cameras
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+def test_of_a_rig_whole_cameras_are_held_out(tmp_path: Path) -> None:
+    capture = load_capture(rig(tmp_path, 9, 3))
+    cameras = {split: {number % 9 for number in numbers(capture, split)} for split in ("train", "val", "test")}
+    assert cameras == {"train": {1, 2, 3, 4, 6, 7}, "val": {5}, "test": {0, 8}}
+    assert [len(capture.split(split)) for split in ("train", "val", "test")] == [18, 3, 6]
+    assert "no split is given: every 8th camera by name is held out for test (6 images)" in capture.notes
+    assert "of the other cameras every 8th is held out for val (3 images)" in capture.notes
+
+
+def test_of_few_cameras_none_is_given_up_and_what_stands_once_is_no_rig(tmp_path: Path) -> None:
+    assert numbers(load_capture(rig(tmp_path / "few", 5, 4)), "test") == [0, 8, 16]
+    assert numbers(load_capture(rig(tmp_path / "once", 20, 1)), "test") == [0, 8, 16]
+    assert numbers(load_capture(rig(tmp_path / "short", 5, 4), CaptureConfig(test_every=4)), "test") == [
+        0,
+        4,
+        5,
+        9,
+        10,
+        14,
+        15,
+        19,
+    ]
 
 
 def test_splits_that_the_file_lists_are_taken(tmp_path: Path) -> None:
