@@ -332,6 +332,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         # With more Gaussians small pictures cost detail; so few are none the worse, and no seed is bad.
         "small_until": 15_000,
         "init": {"max_points": 6_000},
+        # In so few steps what light does from every side is not told from what it does in time.
+        "scene": {"residual_degree": 0},
         # Gradients of the first steps, which find the colour of everything, do not say where detail is missing.
         "density": {
             "statistics_from": 2_000,

@@ -117,7 +117,6 @@ ROWS: Final[tuple[Row, ...]] = (
         paper=PaperResult(35.834, 0.9812, 0.0221, "ablation"),
     ),
     Row("no_rigidity", "without rigidity", {"loss.l_rigid": False}, needs={"loss.rigidity": 0, "batch": 1}),
-    Row("blind_residual", "residual without view", {"scene.residual_degree": 0}, needs={"scene.residual_degree": 0}),
     Row("anchor_deformation", "deformation per anchor", {"scene.deformation": "anchor"}),
 )
 

@@ -23,7 +23,6 @@ CHANGES = {
     "no_residual": {"scene.residual": False},
     "no_canonical": {"scene.canonical": False},
     "no_rigidity": {"loss.l_rigid": False},
-    "blind_residual": {"scene.residual_degree": 0},
     "anchor_deformation": {"scene.deformation": "anchor"},
 }
 
@@ -38,7 +37,6 @@ PAPER = {
     "no_residual": -0.470,
     "no_canonical": -1.148,
     "no_rigidity": None,
-    "blind_residual": None,
     "anchor_deformation": None,
 }
 
