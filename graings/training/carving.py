@@ -133,7 +133,7 @@ class _Cells:
     """A view in cells of several pixels: how many of each, [H, W], show something, and which cell each point is in."""
 
     shown: NDArray[np.int64]
-    cell: NDArray[np.int64]  # in rows, one after the other; of a point outside of the picture it says nothing
+    cell: NDArray[np.int32]  # in rows, one after the other; of a point outside of the picture it says nothing
     inside: NDArray[np.bool_]
 
     @classmethod
@@ -144,7 +144,8 @@ class _Cells:
         columns, rows, inside = _whole_pixels(points, camera)
         down, across = np.arange(0, camera.height, size), np.arange(0, camera.width, size)
         shown = np.add.reduceat(np.add.reduceat(view.mask, down, axis=0, dtype=np.int64), across, axis=1)
-        return cls(shown, rows // size * len(across) + columns // size, inside)
+        cell = (rows // size * len(across) + columns // size).astype(np.int32)  # many points, and as often as views
+        return cls(shown, cell, inside)
 
     def near(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Cells, [H, W], that have one of the `chosen` points in them or next to them."""

@@ -61,16 +61,8 @@ def test_of_a_rig_whole_cameras_are_held_out(tmp_path: Path) -> None:
 def test_of_few_cameras_none_is_given_up_and_what_stands_once_is_no_rig(tmp_path: Path) -> None:
     assert numbers(load_capture(rig(tmp_path / "few", 5, 4)), "test") == [0, 8, 16]
     assert numbers(load_capture(rig(tmp_path / "once", 20, 1)), "test") == [0, 8, 16]
-    assert numbers(load_capture(rig(tmp_path / "short", 5, 4), CaptureConfig(test_every=4)), "test") == [
-        0,
-        4,
-        5,
-        9,
-        10,
-        14,
-        15,
-        19,
-    ]
+    short = load_capture(rig(tmp_path / "short", 5, 4), CaptureConfig(test_every=4))
+    assert {number % 5 for number in numbers(short, "test")} == {0, 4}
 
 
 def test_splits_that_the_file_lists_are_taken(tmp_path: Path) -> None:

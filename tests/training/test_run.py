@@ -44,6 +44,7 @@ def _config(**overrides: object) -> TrainConfig:
         "warmup": 10_000,
         "init.points": 800,
         "scene.children": 4,
+        "scene.residual_degree": 2,  # as all presets but draft have it
         "density.statistics_from": 500,
         "density.grow_from": 4_000,
         "density.grow_every": 8,

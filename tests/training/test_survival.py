@@ -247,7 +247,7 @@ def _peak_bytes() -> int:
 @pytest.mark.parametrize("batch", [1, 4])
 def test_growth_without_end_stops_at_the_budget(micro: Path, batch: int) -> None:
     """E05: everything grows on six levels; the budget is that of the memory, and the memory is not exceeded."""
-    memory_mb = 5  # room for more than the first 150 anchors
+    memory_mb = 4
     trainer = micro_trainer(
         micro,
         batch=batch,
