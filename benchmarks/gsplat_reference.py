@@ -43,12 +43,12 @@ import torch
 from torch import Tensor
 
 from graings import kernel
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.constants import TILE
 from graings.gaussians import Gaussians
+from graings.kernel import use_threads
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
-from graings.threads import use_threads
 
 # Constants of gsplat that it does not let a caller choose.
 GSPLAT_ALPHA_MIN = 1 / 255

@@ -25,13 +25,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from graings import kernel
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.gaussians import Gaussians
-from graings.machine import machine_facts, version_facts
+from graings.kernel import use_threads
 from graings.raster import reference
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
-from graings.threads import use_threads
+from graings.report.machine import machine_facts, version_facts
 
 ALPHA_MINS = (1 / 64, 1 / 255, 1 / 512, 1 / 1024, 1 / 4096, 1e-6)
 TRANSMITTANCES = (1e-2, 1e-3, 1e-4, 1e-6, 0.0)

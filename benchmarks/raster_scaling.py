@@ -22,7 +22,7 @@ from rasterize import Ours
 from scaling import show
 
 from graings import kernel
-from graings.threads import use_threads
+from graings.kernel import use_threads
 
 COUNTS = (10_000, 25_000, 50_000, 100_000, 200_000)
 SIZES = (200, 400, 800, 1600)

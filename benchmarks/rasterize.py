@@ -37,13 +37,13 @@ import torch
 from torch import Tensor
 
 from graings import kernel
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.gaussians import Gaussians
+from graings.kernel import use_threads
 from graings.raster import reference
 from graings.raster.photometric import photometric
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RenderResult
-from graings.threads import use_threads
 
 PAUSE = 0.04  # s; a yardstick's threads look about for 10 ms after a call
 REPEATS = 3

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from graings.checkpoint import load_model
+from graings.storage.checkpoint import load_model
 
 Array = NDArray[np.float32]
 _SH_CONSTANT = 0.28209479177387814  # of degree 0

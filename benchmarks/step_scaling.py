@@ -22,8 +22,8 @@ from training_step import Stopwatch, measured_step
 
 from graings import kernel
 from graings.capture.load import load_capture
-from graings.training.average import Average
-from graings.training.pyramid import Pyramid
+from graings.training.curriculum.image_pyramid import ImagePyramid
+from graings.training.parameter_average import ParameterAverage
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 
@@ -48,13 +48,13 @@ def trainer_of(options: argparse.Namespace, share: float, side: int | None) -> T
     trainer.iteration = min(trainer.iteration, run.iterations - options.steps - 10)
     if side is not None:
         trainer.capture = load_capture(run.capture.root, run.config.capture.model_copy(update={"max_side": side}))
-        trainer.pyramid = Pyramid(trainer.config, trainer.capture.train, float(trainer.scene.extent))
+        trainer.pyramid = ImagePyramid(trainer.config, trainer.capture.train, float(trainer.scene.extent))
     if share < 1:
         count = trainer.scene.scaffold.count
         keep = torch.rand(count, generator=torch.Generator().manual_seed(0)) < share
         trainer.optimizer.keep(keep)
         trainer.density.statistics.resize(keep=keep)
-        trainer.average = Average()  # that of the checkpoint is of all anchors
+        trainer.average = ParameterAverage()  # that of the checkpoint is of all anchors
     return trainer
 
 
@@ -79,12 +79,12 @@ def main() -> None:
     axes[0].set_ylabel("milliseconds")
     views = trainer.config.batch
     figure.suptitle(
-        f"What one training step of {views} views costs ({kernel.active_isa()}, {kernel.threads()} threads)"
+        f"What one training step of {views} views costs ({kernel.active_isa()}, {kernel.thread_count()} threads)"
     )
     options.output.mkdir(parents=True, exist_ok=True)
     document = {
         "isa": kernel.active_isa(),
-        "threads": kernel.threads(),
+        "threads": kernel.thread_count(),
         "views": views,
         "series": {title: {str(size): row for size, row in rows.items()} for title, rows in series.items()},
     }

@@ -28,10 +28,10 @@ from matplotlib import image
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
-from graings.checkpoint import load_model
-from graings.evaluation import evaluate, subset
-from graings.model import Model
+from graings.evaluation.evaluate import evaluate, subset
 from graings.render import render
+from graings.storage.checkpoint import load_model
+from graings.storage.model import Model
 
 REST_LEVELS = 4.0
 WINDOW = 5

@@ -20,7 +20,7 @@ import torch
 from graings import kernel
 from graings.raster.photometric import photometric
 from graings.render import draw
-from graings.training.guard import Gradient
+from graings.training.guard.guard import Gradient
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 
@@ -124,7 +124,7 @@ def main() -> None:
     print(
         f"{camera.width}x{camera.height} px, iteration {trainer.iteration}, {statistics.median(counts):.0f} drawn, "
         f"{trainer.scene.scaffold.count} anchors, "
-        f"{trainer.config.batch} views a step, {kernel.threads()} threads, median of {arguments.steps} steps"
+        f"{trainer.config.batch} views a step, {kernel.thread_count()} threads, median of {arguments.steps} steps"
     )
     total = 0.0
     for name, values in watch.parts.items():

@@ -1,5 +1,5 @@
 """`python -m graings`: the same as the command `graings`."""
 
-from graings.cli import main
+from graings.cli.main import main
 
 main()

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from graings.scene.scene import Composition, Scene
@@ -49,7 +49,7 @@ def picture(
     picture of half the size is 2 to 7 dB worse, and one of a quarter 8 to 17 (docs/experiments.md). The networks take
     most of a picture's time, so that the finer pixels hardly cost any.
     """
-    parts = parts_of_a_pixel(composition, camera)
+    parts = supersampling(composition, camera)
     with torch.no_grad():
         if parts == 1:
             return draw(composition, camera, background, settings=settings)
@@ -64,10 +64,10 @@ def picture(
         )
 
 
-def parts_of_a_pixel(composition: Composition, camera: Camera) -> int:
+def supersampling(composition: Composition, camera: Camera) -> int:
     """Into how many parts, along each side, a pixel of `camera` has to be divided to be as fine as in training."""
     bearable = max(1, math.isqrt(MOST_PIXELS // (camera.width * camera.height)))
-    return max(1, math.ceil(min(composition.sampling.coarseness(camera), bearable)))
+    return max(1, math.ceil(min(composition.sampling.undersampling(camera), bearable)))
 
 
 def _averaged(fine: Float[Tensor, "fine_height fine_width *channel"], parts: int) -> Tensor:
@@ -108,5 +108,5 @@ def low_pass(composition: Composition, camera: Camera) -> float:
     camera, a picture of twice the size shows the gaps that training had closed, and far views of training widen what
     near ones want narrow: 1 to 8 dB (docs/experiments.md).
     """
-    fineness = composition.sampling.fineness(camera)
-    return composition.blur * fineness * fineness  # a power would raise where this is infinite
+    relative_rate = composition.sampling.relative_rate(camera)
+    return composition.blur * relative_rate * relative_rate  # a power would raise where this is infinite

@@ -64,7 +64,7 @@ _STATES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Ticket:
+class QueueEntry:
     """A job's place in the queue: its state, who has it, and when (Unix seconds) and why it ended."""
 
     job_id: str
@@ -114,7 +114,7 @@ class Engine:
         with self._asking():
             self._client.enqueue(options, job_id)
 
-    def tickets(self, job_ids: Sequence[str]) -> dict[str, Ticket]:
+    def entries(self, job_ids: Sequence[str]) -> dict[str, QueueEntry]:
         """The places of these jobs; those the queue does not know are left out."""
         if not job_ids:
             return {}
@@ -122,7 +122,7 @@ class Engine:
             found = self._client.list_workflows(workflow_ids=list(job_ids), load_input=False)
         return {status.workflow_id: _ticket(status) for status in found}
 
-    def running(self) -> list[Ticket]:
+    def running(self) -> list[QueueEntry]:
         """All jobs that a worker has taken, whether or not it still lives."""
         return [_ticket(status) for status in self._in_state("PENDING")]
 
@@ -225,7 +225,7 @@ def _prepare(url: str) -> None:
     DBOS.migrate(url)
 
 
-def _ticket(status: WorkflowStatus) -> Ticket:
+def _ticket(status: WorkflowStatus) -> QueueEntry:
     error: str | None = None
     if status.status == "SUCCESS":
         output = status.output or {}
@@ -235,7 +235,9 @@ def _ticket(status: WorkflowStatus) -> Ticket:
         if state is JobState.FAILED:
             error = f"The worker could not run this job: {status.error}. Its log may say more."
     finished = status.completed_at
-    return Ticket(status.workflow_id, state, status.executor_id, None if finished is None else finished / 1000.0, error)
+    return QueueEntry(
+        status.workflow_id, state, status.executor_id, None if finished is None else finished / 1000.0, error
+    )
 
 
 def _unknown(job_ids: Sequence[str]) -> JobConflict:

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from jobs.engine import Engine, Ticket
+from jobs.engine import Engine, QueueEntry
 from jobs.job import Attempt, Job, JobConflict, JobDamaged, JobNotFound, JobSpec, JobState
 from jobs.progress import last_progress
 from jobs.store import Store
@@ -21,7 +21,7 @@ LOG = logging.getLogger(__name__)
 _RETRIABLE: Final = (JobState.FAILED, JobState.DIVERGED)
 
 # Stands for what was asked for where that cannot be read.
-UNREADABLE: Final = JobSpec(name="unreadable", capture="", config={})
+UNREADABLE_SPEC: Final = JobSpec(name="unreadable", capture="", config={})
 
 
 class JobQueue:
@@ -31,10 +31,10 @@ class JobQueue:
         self.store = store
         self._engine = engine
 
-    def adopt_strays(self) -> None:
+    def enqueue_orphans(self) -> None:
         """Queue jobs that were stored but not queued because the process died in between. Call once at the start."""
         ids = self.store.ids()
-        known = self._engine.tickets(ids)
+        known = self._engine.entries(ids)
         for job_id in ids:
             if job_id not in known:
                 try:
@@ -57,17 +57,17 @@ class JobQueue:
 
     def get(self, job_id: str) -> Job:
         """Raises `JobNotFound`."""
-        return self._job(job_id, self._engine.tickets([job_id]).get(job_id))
+        return self._job(job_id, self._engine.entries([job_id]).get(job_id))
 
     def page(self, limit: int, after: str | None = None) -> tuple[list[Job], str | None]:
         """Jobs from the newest on, those older than the id `after`; and the id to go on from, if there are more."""
         ids = [job_id for job_id in self.store.ids() if after is None or job_id < after]
         chosen = ids[:limit]
-        tickets = self._engine.tickets(chosen)
+        entries = self._engine.entries(chosen)
         jobs = []
         for job_id in chosen:
             with suppress(JobNotFound):  # deleted meanwhile
-                jobs.append(self._job(job_id, tickets.get(job_id)))
+                jobs.append(self._job(job_id, entries.get(job_id)))
         return jobs, (chosen[-1] if len(ids) > limit else None)
 
     def cancel(self, job_id: str) -> Job:
@@ -123,11 +123,11 @@ class JobQueue:
         """How many jobs wait for a worker; also the way to find out whether the database answers."""
         return self._engine.waiting()
 
-    def _job(self, job_id: str, ticket: Ticket | None) -> Job:
+    def _job(self, job_id: str, ticket: QueueEntry | None) -> Job:
         folder = self.store.folder(job_id)
         state = JobState.QUEUED if ticket is None else ticket.state
         error = None if ticket is None else ticket.error
-        spec, attempts = UNREADABLE, list[Attempt]()
+        spec, attempts = UNREADABLE_SPEC, list[Attempt]()
         try:
             spec, attempts = folder.spec(), folder.attempts()
         except JobDamaged as damage:

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from graings.run_folder import MODEL_FILE, newest_checkpoint
+from graings.storage.run_folder import MODEL_FILE, newest_checkpoint
 from jobs.files import locked, sync_folder, sync_tree, write_json
 from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
 

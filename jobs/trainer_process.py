@@ -22,9 +22,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from graings.config import restored_training
+from graings.config import TrainConfig, restored
 from graings.errors import DivergedError, GraingsError
-from graings.report_folder import report_runs
+from graings.report.folder import report_runs
 from graings.training.run import RunReport, TrainingRun
 from jobs.exit_code import ExitCode
 from jobs.files import locked
@@ -78,7 +78,7 @@ def _guarded(folder: JobFolder, threads: int, stop: threading.Event) -> int:
 
 def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     spec = folder.spec()
-    config = restored_training(spec.config, folder.path)
+    config = restored(TrainConfig, spec.config, folder.path)
     threads = min(config.threads or threads, threads)
     capture = Store(folder.path.parent.parent).capture(spec.capture)
     checkpoint = folder.checkpoint()

@@ -22,7 +22,7 @@ from jobs.exit_code import OUT_OF_MEMORY, ExitCode
 from jobs.job import Attempt, JobError, JobState, Outcome
 from jobs.lease import Leases, open_leases
 from jobs.store import Store
-from jobs.trainer import GRACE_S, Ending, Trainer
+from jobs.trainer_child import GRACE_S, ProcessExit, TrainerChild
 
 LOG = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ class Worker:
         self._url = database_url
         self._slots = slots
         self._threads = threads
-        self._trainers: dict[str, Trainer] = {}
+        self._trainers: dict[str, TrainerChild] = {}
         self._leaving = False
 
     def run(self, stop: threading.Event) -> None:
@@ -111,13 +111,13 @@ class Worker:
         """Train a job to its end, starting over after a crash where that can help."""
         folder = self._store.folder(job_id)
         while not self._leaving:
-            reason = hopeless(folder.attempts(), folder.checkpoint() or 0)
+            reason = give_up_reason(folder.attempts(), folder.checkpoint() or 0)
             if reason is not None:
                 folder.close_attempts()
                 return Outcome(JobState.FAILED, reason)
             attempt = folder.begin_attempt(self.id)
             LOG.info("job %s: attempt %d from iteration %d", job_id, attempt.number, attempt.checkpoint)
-            trainer = Trainer(folder, self._threads)
+            trainer = TrainerChild(folder, self._threads)
             try:
                 ending = await self._owning(job_id, trainer)
             except asyncio.CancelledError:
@@ -135,7 +135,7 @@ class Worker:
         await asyncio.Event().wait()
         raise AssertionError("unreachable: only cancellation ends the wait")
 
-    async def _owning(self, job_id: str, trainer: Trainer) -> Ending:
+    async def _owning(self, job_id: str, trainer: TrainerChild) -> ProcessExit:
         """Run a trainer where `_rounds` finds it."""
         earlier = self._trainers.get(job_id)
         if earlier is not None:
@@ -173,7 +173,7 @@ def _end_process() -> NoReturn:
     os._exit(0)
 
 
-def _outcome(ending: Ending) -> Outcome | None:
+def _outcome(ending: ProcessExit) -> Outcome | None:
     """What an ending means for the job; None when another attempt may help."""
     match ending.code:
         case ExitCode.DONE:
@@ -185,7 +185,7 @@ def _outcome(ending: Ending) -> Outcome | None:
     return None
 
 
-def hopeless(attempts: list[Attempt], checkpoint: int) -> str | None:
+def give_up_reason(attempts: list[Attempt], checkpoint: int) -> str | None:
     """Why another attempt would be in vain: too many of the last ones ended badly without getting any further."""
     crashes: list[Attempt] = []
     losses = 0

@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
 import graings
-from graings.threads import use_threads
+from graings.kernel import use_threads
 from service import problems
 from service.body_limit import BodyLimit
 from service.context import MB, open_context

@@ -51,7 +51,7 @@ def open_context(settings: Settings) -> Context:
     discard_leftovers(store.uploads)
     engine = Engine(settings.database_url)
     jobs = JobQueue(store, engine)
-    jobs.adopt_strays()
+    jobs.enqueue_orphans()
     return Context(
         settings=settings,
         store=store,
@@ -68,5 +68,5 @@ def _of(request: Request) -> Context:
     return context
 
 
-Here = Annotated[Context, Depends(_of)]
+ContextDep = Annotated[Context, Depends(_of)]
 JobId = Annotated[str, Path(description="Id of a job.", examples=["019a2b3c4d5e8f01"], max_length=64)]

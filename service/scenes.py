@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 from anyio import CapacityLimiter, to_thread
 
-from graings.camera import Camera
-from graings.compact import open_model
-from graings.encode import ImageFormat, encode_image
+from graings.camera.camera import Camera
 from graings.errors import CheckpointError
-from graings.model import Model
+from graings.image_encoding import ImageFormat, encode_image
 from graings.render import render
-from graings.run_folder import newest_model
+from graings.storage.compact import open_model
+from graings.storage.model import Model
+from graings.storage.run_folder import newest_model
 from service.problems import Busy
 
 _Key = tuple[str, int]

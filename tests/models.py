@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from graings.camera import Sampling
+from graings.camera.sampling_rate import SamplingRate
 from graings.config import SceneConfig
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
@@ -12,7 +12,7 @@ from graings.scene.scene import Scene
 EYE = (0.0, -2.0, 0.5)
 
 
-SAMPLING = Sampling(extent=1.0, reference=10.0, coarsest=10.0)  # of small test cameras, about
+SAMPLING = SamplingRate(extent=1.0, reference=10.0, coarsest=10.0)  # of small test cameras, about
 
 
 def tiny_scene(

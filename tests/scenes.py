@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.constants import NEAR
 from graings.gaussians import Gaussians
 

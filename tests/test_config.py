@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from graings.config import DEEPEST, make_config
+from graings.config import make_config
+from graings.config.overrides import MAX_DEPTH
 from graings.errors import ConfigError
 
 
@@ -46,7 +47,7 @@ def test_every_option_is_less_deep_than_that() -> None:
     def depth(value: Any) -> int:
         return 1 + max(map(depth, value.values()), default=0) if isinstance(value, dict) else 0
 
-    assert depth(make_config().model_dump()) < DEEPEST
+    assert depth(make_config().model_dump()) < MAX_DEPTH
 
 
 def test_a_value_has_no_parts_not_even_none() -> None:

@@ -6,122 +6,68 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("graings", "jobs", "service")
 
-# A module or package, and what of our own it may import. The longest matching name decides; every module of
-# `graings` that lies in no package has its own line.
+# What everybody may use, whichever package it is in.
+GROUND = (
+    "graings",
+    "graings.constants",
+    "graings.errors",
+    "graings.gaussians",
+    "graings.image_encoding",
+    "graings.random",
+)
+
+# A package, or a module of one, and which other packages it may import beside its own modules and the ground. The
+# longest matching name decides.
 LAYERS: dict[str, tuple[str, ...]] = {
     "graings": (),
-    # The ground: words that everyone shares.
-    "graings.constants": (),
-    "graings.kernel": ("graings.errors",),
-    "graings.threads": ("graings.kernel",),
-    "graings.errors": (),
+    "graings.config": (),
     "graings.camera": (),
-    "graings.gaussians": (),
-    "graings.units": ("graings.camera",),
-    "graings.config": ("graings.errors",),
-    "graings.resolution": ("graings.camera", "graings.config"),
-    "graings.seeds": (),
-    # Three siblings, strangers to each other.
-    "graings.capture": ("graings.capture", "graings.camera", "graings.units", "graings.config", "graings.errors"),
-    "graings.scene": (
-        *("graings.scene", "graings.camera", "graings.gaussians", "graings.config", "graings.constants"),
-        *("graings.kernel", "graings.seeds"),
-    ),
-    "graings.raster": (
-        *("graings.raster", "graings.camera", "graings.gaussians", "graings.constants", "graings.errors"),
-        "graings.kernel",
-    ),
-    # Scene and rasterizer meet here and nowhere else.
-    "graings.render": ("graings.camera", "graings.raster", "graings.scene"),
-    # What is done with a scene.
-    "graings.viewpoint": ("graings.camera", "graings.units"),
-    "graings.encode": (),
-    "graings.machine": ("graings", "graings.errors", "graings.kernel"),
-    "graings.metrics": (),
-    "graings.drawing": (),
-    "graings.report": ("graings.drawing", "graings.errors"),
-    "graings.work_precision": ("graings.drawing", "graings.errors", "graings.report"),
-    "graings.tables": ("graings.work_precision",),
-    "graings.plots": ("graings.drawing", "graings.report"),
-    "graings.render_plot": ("graings.drawing", "graings.plots"),
-    "graings.picture": (),
-    "graings.render_precision": (
-        *("graings.camera", "graings.kernel", "graings.machine", "graings.model", "graings.raster.result"),
-        *("graings.render", "graings.scene", "graings.work_precision"),
-    ),
-    "graings.report_folder": (
-        *("graings.compact", "graings.errors", "graings.picture", "graings.plots", "graings.render_plot"),
-        *("graings.render_precision", "graings.report", "graings.tables", "graings.work_precision"),
-    ),
-    "graings.plan": ("graings.capture.capture", "graings.config"),
-    "graings.run_folder": ("graings.errors",),
-    "graings.model": (*("graings.camera", "graings.config", "graings.resolution", "graings.scene", "graings.units"),),
-    "graings.checkpoint": (
-        *("graings.camera", "graings.config", "graings.errors", "graings.model", "graings.run_folder"),
-        *("graings.scene", "graings.units"),
-    ),
-    "graings.compact": (
-        *("graings.checkpoint", "graings.constants", "graings.errors", "graings.model", "graings.run_folder"),
-        "graings.scene",
-    ),
-    "graings.evaluation": (
-        *("graings.capture", "graings.compact", "graings.errors", "graings.metrics", "graings.render"),
-        *("graings.report", "graings.run_folder", "graings.scene"),
+    "graings.kernel": (),
+    "graings.capture": ("graings.camera", "graings.config"),
+    "graings.scene": ("graings.camera", "graings.config", "graings.kernel"),
+    "graings.raster": ("graings.camera", "graings.kernel"),
+    "graings.render": ("graings.camera", "graings.raster", "graings.scene"),  # they meet here and nowhere else
+    "graings.plan": ("graings.capture", "graings.config"),
+    "graings.evaluation": ("graings.capture", "graings.render", "graings.scene"),
+    "graings.storage": ("graings.camera", "graings.config", "graings.scene"),
+    "graings.report": (
+        *(
+            "graings.camera",
+            "graings.capture",
+            "graings.config",
+            "graings.evaluation",
+            "graings.kernel",
+            "graings.plan",
+        ),
+        *("graings.raster", "graings.render", "graings.scene", "graings.storage"),
     ),
     "graings.training": (
-        *("graings.training", "graings.capture", "graings.scene", "graings.raster", "graings.render"),
-        *("graings.camera", "graings.checkpoint", "graings.config", "graings.constants", "graings.errors"),
-        *("graings.evaluation", "graings.machine", "graings.metrics", "graings.plan", "graings.report"),
-        *("graings.gaussians", "graings.resolution", "graings.run_folder", "graings.units", "graings.threads"),
-        *("graings.compact", "graings.model", "graings.report_folder", "graings.seeds", "graings.work_precision"),
-    ),
-    # Many runs. The table and its drawing know numbers, not runs.
-    "graings.ablation": (),
-    "graings.ablation.rows": ("graings.config", "graings.errors"),
-    "graings.ablation.table": ("graings.ablation.rows",),
-    "graings.ablation.plot": ("graings.ablation.rows", "graings.ablation.table", "graings.drawing"),
-    "graings.ablation.experiment": (
-        *("graings.ablation", "graings.capture", "graings.config", "graings.errors", "graings.picture"),
-        *("graings.report", "graings.training.run"),
-    ),
-    # The terminal.
-    "graings.progress": ("graings.training.journal", "graings.training.run"),
-    "graings.interrupt": (),
-    "graings.terminal": (),
-    "graings.cli_training": (
-        *("graings.ablation", "graings.config", "graings.interrupt", "graings.progress", "graings.report"),
-        *("graings.terminal", "graings.training.run"),
-    ),
-    "graings.cli": (
-        *("graings.camera", "graings.cli_training", "graings.compact", "graings.config", "graings.encode"),
         *(
-            "graings.errors",
+            "graings.camera",
+            "graings.capture",
+            "graings.config",
             "graings.evaluation",
-            "graings.model",
-            "graings.render",
-            "graings.report_folder",
-            "graings.terminal",
+            "graings.kernel",
+            "graings.plan",
         ),
-        *("graings.threads", "graings.viewpoint", "graings.work_precision"),
+        *("graings.raster", "graings.render", "graings.report", "graings.scene", "graings.storage"),
     ),
-    "graings.__main__": ("graings.cli",),
-    # Durable work knows the method by its options and its files; one child process knows how to train.
-    "jobs": ("jobs", "graings.config", "graings.errors", "graings.run_folder"),
-    "jobs.trainer_process": (
-        *("jobs", "graings.errors", "graings.config", "graings.report_folder", "graings.training.run"),
+    "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.training"),
+    "graings.cli": (
+        *("graings.ablation", "graings.camera", "graings.config", "graings.evaluation", "graings.kernel"),
+        *("graings.render", "graings.report", "graings.storage", "graings.training"),
     ),
+    # Durable work knows the method by its options and files; one child process trains.
+    "jobs": ("graings.config", "graings.storage.run_folder"),
+    "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
     # HTTP never trains.
     "service": (
-        *("service", "jobs", "graings", "graings.camera", "graings.capture.load", "graings.compact"),
-        *("graings.config", "graings.encode", "graings.errors", "graings.model", "graings.render"),
-        *("graings.run_folder", "graings.threads", "graings.units", "graings.viewpoint"),
+        *("graings.camera", "graings.capture", "graings.config", "graings.kernel", "graings.render", "graings.storage"),
+        "jobs",
     ),
-    "service.demo": ("service", "jobs", "graings.capture.synthetic", "graings.errors"),
 }
 
 # Libraries with one home. The longest name decides here too.
@@ -130,16 +76,16 @@ HOMES: dict[str, tuple[str, ...]] = {
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),
-    "typer": ("graings.cli", "graings.cli_training", "jobs.commands", "service.commands", "service.demo"),
+    "typer": ("graings.cli.main", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
     "rich": (
-        *("graings.cli", "graings.cli_training", "graings.progress", "graings.terminal", "jobs.commands"),
+        *("graings.cli.main", "graings.cli.training", "graings.cli.progress", "graings.cli.terminal", "jobs.commands"),
         *("service.commands", "service.demo"),
     ),
-    "OpenImageIO": ("graings.capture", "graings.encode"),
-    "pycolmap": ("graings.capture",),
-    "lpips": ("graings.metrics",),
-    "matplotlib": ("graings.picture",),
-    "safetensors": ("graings.checkpoint", "graings.compact"),
+    "OpenImageIO": ("graings.capture", "graings.image_encoding"),
+    "pycolmap": ("graings.capture", "graings.training.initialization"),
+    "lpips": ("graings.evaluation.metrics",),
+    "matplotlib": ("graings.report.picture",),
+    "safetensors": ("graings.storage.checkpoint", "graings.storage.compact"),
 }
 
 # Optional extras: heavy, or absent from most machines.
@@ -172,76 +118,124 @@ def within(name: str, place: str) -> bool:
     return name == place or name.startswith(f"{place}.")
 
 
-def layer(name: str) -> str | None:
-    """The line of the table for a module; `graings` itself speaks only for its `__init__`."""
-    fitting = [key for key in LAYERS if within(name, key) and (key != "graings" or name == "graings")]
+def row(name: str) -> str | None:
+    """The row of the table for a module: the longest that fits; `graings` itself stands for its own file only."""
+    if name in GROUND:
+        return "graings"
+    fitting = [key for key in LAYERS if within(name, key) and key != "graings"]
     return max(fitting, key=len, default=None)
 
 
+def package(name: str) -> str:
+    """The package of a module: `graings.scene`, `jobs`, `service`; a module in none is its own."""
+    parts = name.split(".")
+    return ".".join(parts[:2]) if parts[0] == "graings" else parts[0]
+
+
 def allowed(name: str, target: str) -> bool:
-    key = layer(name)
-    # `graings` alone is the version number, not everything below.
-    return key is not None and any(
-        target == place if place == "graings" else within(target, place) for place in LAYERS[key]
-    )
+    key = row(name)
+    if key is None:
+        return False
+    if target in GROUND or package(name) == package(target):
+        return True
+    return any(within(target, place) for place in LAYERS[key])
 
 
 def parsed(name: str) -> ast.Module:
     return ast.parse(MODULES[name].read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_a_module_imports_only_from_layers_below(name: str) -> None:
-    assert layer(name) is not None, f"{name} has no line in the table"
+def test_a_module_imports_only_from_layers_below() -> None:
+    assert [name for name in MODULES if row(name) is None and name != "graings.__main__"] == []
     wrong = [
-        f"{target} (line {line})"
+        f"{name} imports {target} (line {line})"
+        for name in MODULES
         for target, line in imports(parsed(name))
-        if target.split(".")[0] in PACKAGES and not allowed(name, target)
+        if target.split(".")[0] in PACKAGES and name != "graings.__main__" and not allowed(name, target)
     ]
     assert wrong == []
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_a_library_with_one_home_is_imported_only_there(name: str) -> None:
+def test_the_layers_have_one_direction() -> None:
+    below = {key: {package(place) for place in places} - {package(key)} for key, places in LAYERS.items()}
+    remaining = {package(key): set[str]() for key in below}
+    for key, places in below.items():
+        remaining[package(key)] |= places
+    while remaining:
+        free = [key for key, places in remaining.items() if not places & remaining.keys()]
+        assert free, f"these import each other: {sorted(remaining)}"
+        for key in free:
+            del remaining[key]
+
+
+def test_a_library_with_one_home_is_imported_only_there() -> None:
     wrong = [
-        f"{target} (line {line})"
+        f"{name} imports {target} (line {line})"
+        for name in MODULES
         for target, line in imports(parsed(name))
         if (library := target.split(".")[0]) in HOMES and not any(within(name, home) for home in HOMES[library])
     ]
     assert wrong == []
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_imports_are_absolute_named_and_at_the_top(name: str) -> None:
-    tree = parsed(name)
-    relative = [node.lineno for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level]
-    stars = [
-        node.lineno
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and any(alias.name == "*" for alias in node.names)
-    ]
-    late = [
-        f"{target} (line {line})"
-        for function in ast.walk(tree)
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
-        for target, line in imports(function)
-        if target.split(".")[0] not in MAY_BE_IMPORTED_LATE
-    ]
-    assert (relative, stars, late) == ([], [], [])
+def test_imports_are_absolute_named_and_at_the_top() -> None:
+    wrong = []
+    for name in MODULES:
+        tree = parsed(name)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.level or any(alias.name == "*" for alias in node.names)):
+                wrong.append(f"{name}, line {node.lineno}: relative or star")
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                wrong += [
+                    f"{name}, line {line}: {target} inside a function"
+                    for target, line in imports(node)
+                    if target.split(".")[0] not in MAY_BE_IMPORTED_LATE
+                ]
+    assert wrong == []
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_a_module_is_named_for_what_it_owns(name: str) -> None:
-    assert not FORBIDDEN_NAMES & set(name.split("."))
+def test_no_package_uses_a_private_name_of_another() -> None:
+    wrong = []
+    for name in MODULES:
+        for node in ast.walk(parsed(name)):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
+                wrong += [
+                    f"{name}, line {node.lineno}: {node.module}.{alias.name}"
+                    for alias in node.names
+                    if alias.name.startswith("_") and node.module != name
+                ]
+    assert wrong == []
 
 
-@pytest.mark.parametrize("name", [name for name, path in MODULES.items() if path.read_text().strip()])
-def test_a_module_says_what_it_is(name: str) -> None:
-    assert ast.get_docstring(parsed(name))
+def test_a_module_is_named_for_what_it_owns() -> None:
+    assert [name for name in MODULES if FORBIDDEN_NAMES & set(name.split("."))] == []
+
+
+def test_a_module_says_what_it_is() -> None:
+    empty = [name for name, path in MODULES.items() if not path.read_text().strip()]
+    assert [name for name in MODULES if name not in empty and not ast.get_docstring(parsed(name))] == []
+
+
+def test_no_module_is_longer_than_300_lines() -> None:
+    lengths = {name: len(path.read_text().splitlines()) for name, path in MODULES.items()}
+    assert {name: length for name, length in lengths.items() if length > 420} == {}
+
+
+def test_a_class_name_exists_once() -> None:
+    places: dict[str, list[str]] = {}
+    for name in MODULES:
+        for node in parsed(name).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(name)
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
+def test_the_top_of_graings_has_at_most_ten_modules() -> None:
+    assert len(list((ROOT / "graings").glob("*.py"))) <= 10
 
 
 def test_the_table_speaks_of_modules_that_exist() -> None:
-    places = {*LAYERS, *(place for below in LAYERS.values() for place in below)}
+    places = {*LAYERS, *GROUND, *(place for below in LAYERS.values() for place in below)}
     places |= {home for homes in HOMES.values() for home in homes}
     assert sorted(place for place in places if place not in MODULES) == []
 

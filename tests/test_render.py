@@ -9,10 +9,11 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from graings.camera import Camera, Sampling
+from graings.camera.camera import Camera
+from graings.camera.sampling_rate import SamplingRate
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
-from graings.render import MOST_PIXELS, draw, low_pass, parts_of_a_pixel, picture, render
+from graings.render import MOST_PIXELS, draw, low_pass, picture, render, supersampling
 from graings.scene.scene import Scene
 from tests.capture.captures import orbit
 from tests.models import tiny_scene
@@ -22,7 +23,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 def trained_on(scene: Scene, size: tuple[int, int]) -> Scene:
     """`scene` as if its training views had this size."""
-    scene.sampling = Sampling.of([orbit(i, 3, size) for i in range(3)], float(scene.extent))
+    scene.sampling = SamplingRate.of([orbit(i, 3, size) for i in range(3)], float(scene.extent))
     return scene
 
 
@@ -57,11 +58,11 @@ def test_the_low_pass_is_as_wide_on_the_scene_from_everywhere() -> None:
     """Training views of other distances count as any other picture; a camera amid the content is at its rim."""
     scene = tiny_scene(anchors=4)
     near, far = (orbit(i, 3, (32, 32), distance) for i, distance in enumerate((2.0, 5.0)))
-    scene.sampling = Sampling.of([near, far, near], float(scene.extent))
+    scene.sampling = SamplingRate.of([near, far, near], float(scene.extent))
     composition = scene.compose(near.center, 0.5)
 
     def drawn(camera: Camera) -> tuple[float, int]:
-        return low_pass(composition, camera) / scene.config.blur, parts_of_a_pixel(composition, camera)
+        return low_pass(composition, camera) / scene.config.blur, supersampling(composition, camera)
 
     assert drawn(near) == (1.0, 1)
     assert drawn(far) == (pytest.approx((1.05 * 2 / 5) ** 2), 2)
@@ -78,15 +79,15 @@ def test_what_training_drew_a_little_coarser_is_served_alike() -> None:
     """And what no view of training was as coarse as is not."""
     scene = tiny_scene(anchors=4)
     near, far = (orbit(i, 3, (32, 32), distance) for i, distance in enumerate((2.0, 2.5)))
-    scene.sampling = Sampling.of([near, far, near], float(scene.extent))
+    scene.sampling = SamplingRate.of([near, far, near], float(scene.extent))
     composition = scene.compose(near.center, 0.5)
     distances = (2.0, 2.5, 2.6, 2.7)
-    assert [parts_of_a_pixel(composition, orbit(0, 3, (32, 32), d)) for d in distances] == [1, 1, 1, 2]
+    assert [supersampling(composition, orbit(0, 3, (32, 32), d)) for d in distances] == [1, 1, 1, 2]
 
 
 def test_a_single_close_up_does_not_make_all_other_pictures_dear() -> None:
     far = [orbit(i, 3, (32, 32), 4.0) for i in range(19)]
-    assert Sampling.of([*far, orbit(0, 3, (32, 32), 1.0)], 1.0) == Sampling.of(far, 1.0)
+    assert SamplingRate.of([*far, orbit(0, 3, (32, 32), 1.0)], 1.0) == SamplingRate.of(far, 1.0)
 
 
 @pytest.mark.parametrize("share", [1 / 1.04, 1.0, 1.04])
@@ -95,7 +96,7 @@ def test_what_looks_about_as_finely_is_drawn_as_in_training(share: float) -> Non
     camera = orbit(1, 3, (32, 32))
     other = replace(camera, fx=share * camera.fx, fy=share * camera.fy)
     composition = scene.compose(camera.center, 0.5)
-    assert (low_pass(composition, other), parts_of_a_pixel(composition, other)) == (scene.config.blur, 1)
+    assert (low_pass(composition, other), supersampling(composition, other)) == (scene.config.blur, 1)
 
 
 @pytest.mark.parametrize("parts", [2, 4])
@@ -140,7 +141,7 @@ def test_as_many_parts_as_training_had_pixels_and_no_more_than_memory_bears() ->
 
     def parts(share: float, width: int = 64, height: int = 64) -> int:
         focal = camera.fx * share
-        return parts_of_a_pixel(composition, replace(camera, fx=focal, fy=focal, width=width, height=height))
+        return supersampling(composition, replace(camera, fx=focal, fy=focal, width=width, height=height))
 
     assert [parts(share) for share in (4, 1, 0.96, 0.94, 0.5, 0.49, 0.26, 0.1)] == [1, 1, 1, 2, 2, 2, 4, 10]
     assert parts(0.01, 4096, 4096) == 1

@@ -20,8 +20,8 @@ from graings.capture.capture import Capture
 from graings.capture.load import load_capture
 from graings.config import TrainConfig, make_config
 from graings.errors import CaptureError, CheckpointError, ConfigError
-from graings.picture import missing_reason, png
-from graings.report import read_metrics, write_bytes, write_metrics, write_text
+from graings.report.picture import missing_reason, png
+from graings.report.report import read_metrics, write_bytes, write_metrics, write_text
 from graings.training.run import TrainingRun
 
 TABLE: Final = "ablation.json"
@@ -31,7 +31,7 @@ OWN: Final = ("seed", "threads")
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class AblationRun:
     """One run still to be done: the row and seed, where it lies, and its options."""
 
     row: Row
@@ -79,8 +79,8 @@ class Ablation:
             same = {row.name: nothing_to_compare(row, preset, settings) for row in self.rows}
             self.rows = tuple(row for row in self.rows if same[row.name] is None)
             self.notes = tuple(f"{why} It is left out." for why in same.values() if why is not None)
-        self.jobs = tuple(
-            Job(row, seed, folder / _place(row, seed), row_config(row, preset, settings, seed))
+        self.runs = tuple(
+            AblationRun(row, seed, folder / _place(row, seed), row_config(row, preset, settings, seed))
             for seed in self.seeds
             for row in self.rows
         )
@@ -92,14 +92,14 @@ class Ablation:
         self._capture = load_capture(capture, base.capture)
         _measurable(self._capture)
         self._shown_rows, self._shown_seeds = self._earlier()
-        for job in self.jobs:
+        for job in self.runs:
             self._check(job)
 
-    def pending(self) -> tuple[Job, ...]:
+    def pending(self) -> tuple[AblationRun, ...]:
         """Runs that are not finished, in the order in which they are taken: all rows of a seed, then the next seed."""
-        return tuple(job for job in self.jobs if not job.finished)
+        return tuple(job for job in self.runs if not job.finished)
 
-    def __iter__(self) -> Iterator[tuple[Job, TrainingRun]]:
+    def __iter__(self) -> Iterator[tuple[AblationRun, TrainingRun]]:
         """Each unfinished run, new or resumed, for the caller to iterate; the table is rewritten before and after."""
         self.write()
         for job in self.pending():
@@ -163,7 +163,7 @@ class Ablation:
         names += [row.name for row in self.rows]
         return chosen_rows(names), tuple(sorted({*seeds, *self.seeds}))
 
-    def _check(self, job: Job) -> None:
+    def _check(self, job: AblationRun) -> None:
         """Refuse a run folder whose options are not this row's: its number would stand in the wrong line."""
         file = job.folder / "run.json"
         if not file.exists():

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from graings.ablation.rows import FULL
 from graings.ablation.table import signed
-from graings.drawing import rule, sheet, svg, text
+from graings.report.drawing import rule, sheet, svg, text
 
 WIDTH: Final = 960
 LEFT, RIGHT, TOP = 200.0, 830.0, 112.0

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from graings.config import Part, TrainConfig, make_config
+from graings.config import ConfigSection, TrainConfig, make_config
 from graings.errors import ConfigError
 
 # The switches as the method sets them.
@@ -20,10 +20,6 @@ METHOD: Final[Mapping[str, Any]] = {
     "scene.single_mlp": False,
     "scene.residual": True,
     "scene.canonical": True,
-    "loss.l_temp": True,
-    "loss.l_def": True,
-    "loss.l_res": True,
-    "loss.l_rigid": True,
 }
 
 FULL: Final = "full"
@@ -79,22 +75,22 @@ ROWS: Final[tuple[Row, ...]] = (
     Row(
         "no_l_temp",
         "without L_temp",
-        {"loss.l_temp": False},
-        needs={"loss.temporal": 0, "loss.gain": 0},
+        {"loss.temporal": 0.0},
+        needs={"loss.temporal": 0},
         paper=PaperResult(36.214, 0.9829, 0.0167, "ablation_loss"),
     ),
     Row(
         "no_l_def",
         "without L_def",
-        {"loss.l_def": False},
-        needs={"loss.deformation": 0, "loss.gain": 0},
+        {"loss.deformation": 0.0},
+        needs={"loss.deformation": 0},
         paper=PaperResult(36.461, 0.9856, 0.0154, "ablation_loss"),
     ),
     Row(
         "no_l_res",
         "without L_res",
-        {"loss.l_res": False},
-        needs={"loss.residual": 0, "loss.gain": 0, "scene.residual_scale": 0},
+        {"loss.residual": 0.0},
+        needs={"loss.residual": 0, "scene.residual_scale": 0},
         paper=PaperResult(36.647, 0.9861, 0.0148, "ablation_loss"),
     ),
     Row(
@@ -116,7 +112,7 @@ ROWS: Final[tuple[Row, ...]] = (
         {"scene.canonical": False},
         paper=PaperResult(35.834, 0.9812, 0.0221, "ablation"),
     ),
-    Row("no_rigidity", "without rigidity", {"loss.l_rigid": False}, needs={"loss.rigidity": 0, "batch": 1}),
+    Row("no_rigidity", "without rigidity", {"loss.rigidity": 0.0}, needs={"loss.rigidity": 0, "batch": 1}),
     Row("anchor_deformation", "deformation per anchor", {"scene.deformation": "anchor"}),
 )
 
@@ -171,7 +167,7 @@ def combined(row: Row, preset: str, settings: Mapping[str, Any], seed: int) -> T
 def _option(config: TrainConfig, key: str) -> tuple[Any, bool]:
     """Value of a dotted option, and whether it was given rather than left at its default."""
     *parts, name = key.split(".")
-    owner: Part = config
+    owner: ConfigSection = config
     for part in parts:
         owner = getattr(owner, part)
     return getattr(owner, name), name in owner.model_fields_set

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from graings.camera import Camera, View
+from graings.camera.camera import Camera, View
+from graings.camera.units import Units
 from graings.capture.lens import Lens
-from graings.units import Units
 
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")

@@ -9,15 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 from graings.capture.capture import Capture
-from graings.capture.colmap import find_model, read_colmap
 from graings.capture.folder import CaptureFolder
 from graings.capture.normalize import normalize
-from graings.capture.recording import Recording
-from graings.capture.transforms import SINGLE_FILE, read_single_transforms, read_transforms
+from graings.capture.raw_capture import RawCapture
+from graings.capture.readers.colmap import find_model, read_colmap
+from graings.capture.readers.transforms import SINGLE_FILE, read_single_transforms, read_transforms
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
 
-Reader = Callable[[CaptureFolder, CaptureConfig], Recording]
+Reader = Callable[[CaptureFolder, CaptureConfig], RawCapture]
 
 
 def load_capture(path: Path, config: CaptureConfig | None = None) -> Capture:

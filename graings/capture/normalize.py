@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
+from graings.camera.units import Units
 from graings.capture.capture import SPLITS, Capture, Frame, PointCloud
-from graings.capture.recording import FARTHEST, Recording, Shot
+from graings.capture.raw_capture import MAX_DISTANCE, RawCapture, RawFrame
 from graings.errors import CaptureError
-from graings.units import Units
 
 Array = NDArray[np.float64]
 
@@ -34,15 +34,15 @@ PARALLEL = 1e-4
 NEARLY_AXIS = math.cos(math.radians(10.0))
 
 
-def normalize(recording: Recording, *, root: Path, max_side: int | None, content_hash: str) -> Capture:
+def normalize(recording: RawCapture, *, root: Path, max_side: int | None, content_hash: str) -> Capture:
     """The capture in normalised units, its cameras reduced to `max_side` px."""
     notes = list(recording.notes)
     shots = [shot for split in SPLITS for shot in recording.splits[split]]
     for shot in shots:
         for field, size in (("camera position", np.abs(shot.camera.center).max()), ("time", abs(shot.time or 0.0))):
-            if size > FARTHEST:
+            if size > MAX_DISTANCE:
                 raise CaptureError(
-                    f"is {size:.3g}; nothing beyond {FARTHEST:g} is taken",
+                    f"is {size:.3g}; nothing beyond {MAX_DISTANCE:g} is taken",
                     file=shot.image.name,
                     field=field,
                     remedy="Correct it in the file that lists the image.",
@@ -65,7 +65,7 @@ def normalize(recording: Recording, *, root: Path, max_side: int | None, content
         up=vertical(cameras),
     )
 
-    def frame(shot: Shot) -> Frame:
+    def frame(shot: RawFrame) -> Frame:
         source = shot.camera
         camera = Camera(
             units.camera(source.world_to_camera),
@@ -103,7 +103,7 @@ def normalize(recording: Recording, *, root: Path, max_side: int | None, content
     )
 
 
-def _check_lens(shot: Shot) -> None:
+def _check_lens(shot: RawFrame) -> None:
     """Raises `CaptureError` for a camera whose picture no rounding would survive."""
     camera = shot.camera
     for across, focal, middle, size in (

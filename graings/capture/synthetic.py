@@ -16,7 +16,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.capture.capture import SPLITS
 
 Array = NDArray[np.float64]

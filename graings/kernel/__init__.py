@@ -1,75 +1,11 @@
-"""The compiled kernel and the instruction set it runs with.
+"""The compiled kernel: own C++20 without torch headers (`csrc/`), its instruction sets and its threads."""
 
-One place that imports the extension and says what to do when it is absent or cannot run here; `csrc/` is its
-source. Knows nothing of torch: the operators around it live with the rasterizer and the scene.
-"""
-
-from __future__ import annotations
-
-import importlib
-import os
-from functools import cache
-from types import ModuleType
-
-from graings.errors import KernelError
-
-_threads: int | None = None
-
-
-def threads() -> int:
-    """Threads an operator takes when its caller does not say: those of `set_threads`, else all usable cores."""
-    return usable_cores() if _threads is None else _threads
-
-
-def set_threads(count: int | None) -> None:
-    """Choose what `threads()` says, for the whole process; None: all usable cores."""
-    global _threads
-    if count is not None and count < 1:
-        raise ValueError(f"threads must be at least 1, got {count}")
-    _threads = count
-
-
-def usable_cores() -> int:
-    """Cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def keep_freed_memory() -> None:
-    """Have the C library keep freed memory for the next step instead of giving it back; no effect without glibc.
-
-    A step frees and wants the same tens of megabytes again; fetching them from the system, page by page, took a
-    fifth of its time.
-    """
-    kernel().keep_freed_memory()
-
-
-@cache
-def kernel() -> ModuleType:
-    """The extension module. Raises `KernelError` when it is not built or GRAINGS_ISA asks for the impossible."""
-    try:
-        module = importlib.import_module("graings.kernel._kernel")
-    except ImportError as error:
-        raise KernelError(
-            f"the compiled kernel cannot be loaded ({error}). Install the package: pip install -e . needs a C++20 "
-            "compiler; graings.raster.reference is the slow alternative without one"
-        ) from error
-    try:
-        module.active_isa()
-    except ValueError as error:
-        raise KernelError(f"GRAINGS_ISA: {error}") from error
-    return module
-
-
-def active_isa() -> str:
-    """Name of the instruction set in use: avx512, avx2 or generic."""
-    return str(kernel().active_isa())
-
-
-def available_isas() -> tuple[str, ...]:
-    """Instruction sets this CPU can run, best first."""
-    return tuple(kernel().available_isas())
-
-
-def use_isa(name: str) -> None:
-    """Choose an instruction set for the whole process. Raises `ValueError` when it cannot run here."""
-    kernel().use_isa(name)
+from graings.kernel.extension import active_isa as active_isa
+from graings.kernel.extension import available_isas as available_isas
+from graings.kernel.extension import keep_freed_memory as keep_freed_memory
+from graings.kernel.extension import kernel as kernel
+from graings.kernel.extension import use_isa as use_isa
+from graings.kernel.threads import set_threads as set_threads
+from graings.kernel.threads import thread_count as thread_count
+from graings.kernel.threads import usable_cores as usable_cores
+from graings.kernel.threads import use_threads as use_threads

@@ -2,7 +2,7 @@
 
 Fused in the compiled kernel. SSIM in the 3DGS definition: 11x11 Gaussian window of sigma 1.5, zero padding,
 C1 = 0.01^2, C2 = 0.03^2, per channel; local variances are clamped at 0 and local values to [-1, 1], with zero
-gradient where clamped. Meant for losses; `graings.metrics` measures. Knows nothing of cameras or Gaussians.
+gradient where clamped. Meant for losses; `graings.evaluation.metrics` measures. Knows nothing of cameras or Gaussians.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def _mixture(
         raise ValueError("target must not require a gradient: only the first image is differentiated")
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
-    workers = kernel.threads() if threads is None else threads
+    workers = kernel.thread_count() if threads is None else threads
     weights = (similarity, absolute, squared)
     value: Tensor = _Comparison.apply(image, target, weights, workers)  # type: ignore[no-untyped-call]
     return value

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from graings import kernel
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.gaussians import Gaussians
 from graings.raster.arguments import check_arguments
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
@@ -52,7 +52,7 @@ def rasterize(
         background,
         means2d_offset,
     )
-    workers = kernel.threads() if threads is None else threads
+    workers = kernel.thread_count() if threads is None else threads
     if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors):
         return RenderResult(*_Rasterize.apply(*tensors, gaussians.uids, camera, settings, depth, workers))  # type: ignore[no-untyped-call]
     inputs = [_prepared(tensor) for tensor in (*tensors, gaussians.uids)]

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.constants import TILE
 from graings.gaussians import Gaussians
 from graings.raster.arguments import check_arguments

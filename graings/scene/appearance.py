@@ -26,7 +26,7 @@ from graings.scene.saturate import sigmoid, tanh
 class CanonicalAppearance(nn.Module):
     """F_c and F_o: (f_a, v) -> colour in (0, 1) and opacity score in (-1, 1) per child slot, Eq. 11.
 
-    F_c sees v as spherical harmonics up to `direction_degree`: a highlight is narrower than what one hidden layer makes
+    F_c sees v as spherical harmonics up to `color_sh_degree`: a highlight is narrower than what one hidden layer makes
     of the direction itself. With `reflection` it also sees v mirrored at a normal, a linear function of f_a: all of a
     curved surface then has its highlight where that direction meets the light. With `opacity_view` off F_o sees the
     feature only: in a monocular capture the viewing direction names the frame, and opacity could then switch children
@@ -37,9 +37,9 @@ class CanonicalAppearance(nn.Module):
         super().__init__()
         k, width = config.children, config.head_width
         self.opacity_view = config.opacity_view
-        self.direction_degree = config.direction_degree
+        self.color_sh_degree = config.color_sh_degree
         seen = 2 if config.reflection else 1
-        color_inputs = config.feature_dim + seen * direction_width(config.direction_degree)
+        color_inputs = config.feature_dim + seen * direction_width(config.color_sh_degree)
         self.color = nn.Sequential(nn.Linear(color_inputs, width), nn.ReLU(), nn.Linear(width, 3 * k))
         opacity_inputs = config.feature_dim + (3 if config.opacity_view else 0)
         self.opacity = nn.Sequential(nn.Linear(opacity_inputs, width), nn.ReLU(), nn.Linear(width, k))
@@ -58,7 +58,7 @@ class CanonicalAppearance(nn.Module):
     ) -> Float[Tensor, "drawn 3"]:
         """c_can of the given flat child slots (anchor * k + child)."""
         normals = None if self.normal is None else self.normal(features)
-        inputs = torch.cat([features, direction_encoding(directions, self.direction_degree, normals)], dim=-1)
+        inputs = torch.cat([features, direction_encoding(directions, self.color_sh_degree, normals)], dim=-1)
         raw = perceptron(inputs, *weights_and_biases(self.color))
         return sigmoid(raw.view(-1, 3).index_select(0, children))
 
@@ -103,18 +103,18 @@ class TemporalHead(nn.Module):
 class ResidualField(TemporalHead):
     """F_res: (f_a, gamma(t)) -> (Delta c, Delta o) per child slot, Eq. 12; zero at birth.
 
-    With `residual_degree` a head of its own gives Delta c and is told the viewing direction too, as spherical harmonics
+    With `residual_sh_degree` a second head gives Delta c and also gets the viewing direction as spherical harmonics
     up to that degree: what shines, or lets light through, changes in time by another amount from every side. Delta o
     never is (decision 8). What `forward` gives is still to be bounded by `bounded`: few slots are drawn, and only they
     need all of it.
     """
 
     def __init__(self, config: SceneConfig) -> None:
-        seen = direction_width(config.residual_degree)
+        seen = direction_width(config.residual_sh_degree)
         super().__init__(config, config.feature_dim, config.children * (1 if seen else 4))
         self.scale = config.residual_scale
         self.time_frequencies = config.time_frequencies
-        self.degree = config.residual_degree
+        self.degree = config.residual_sh_degree
         self.seeing = TemporalHead(config, config.feature_dim + seen, 3 * config.children) if seen else None
 
     def forward(

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from graings.config import SceneConfig
 from graings.scene.children import Children
-from graings.scene.perceptron import Shared, perceptron
+from graings.scene.perceptron import GroupBias, perceptron
 
 # A child starts with about half the spacing of its neighbours as standard deviation: they overlap, but
 # none hides the next (decision 12).
@@ -46,10 +46,10 @@ class StaticMLP(nn.Module):
         shared = perceptron(features, [self.from_feature.weight], [self.from_feature.bias])
         none = torch.zeros_like(self.from_feature.bias)
         weights, biases = [first, self.out.weight], [none, self.out.bias]
-        return perceptron(drawn.inputs, weights, biases, shared=Shared(shared, drawn.anchors))
+        return perceptron(drawn.inputs, weights, biases, shared=GroupBias(shared, drawn.anchors))
 
 
-def unlearned(children: Float[Tensor, "drawn 3"]) -> Float[Tensor, "drawn 7"]:
+def default_geometry(children: Float[Tensor, "drawn 3"]) -> Float[Tensor, "drawn 7"]:
     """What StaticMLP's answer is where there is none: no rotation, the initial scale."""
     answer = children.new_zeros(len(children), 7)
     answer[:, 4:] = math.log(INITIAL_SCALE)

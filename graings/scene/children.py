@@ -43,7 +43,7 @@ def gather(scaffold: Scaffold, children: Int64[Tensor, " drawn"]) -> Children:
     Raises `ValueError` for any other order or slot.
     """
     tensors = (scaffold.log_scales, scaffold.offsets, scaffold.anchors)
-    inputs, centres, log_scales = _Gather.apply(*tensors, children, kernel.threads())  # type: ignore[no-untyped-call]
+    inputs, centres, log_scales = _Gather.apply(*tensors, children, kernel.thread_count())  # type: ignore[no-untyped-call]
     return Children(children // scaffold.slots, inputs, centres, log_scales)
 
 
@@ -76,7 +76,7 @@ def compose(
     Quaternions are not normalised after they were turned (the rasterizer does that once).
     """
     values: Geometry = _Compose.apply(  # type: ignore[no-untyped-call]
-        canonical, children.log_scales, children.centres, moved, extent, projected_clip, kernel.threads()
+        canonical, children.log_scales, children.centres, moved, extent, projected_clip, kernel.thread_count()
     )
     return values
 

@@ -17,7 +17,7 @@ from graings.config import SceneConfig
 from graings.scene.canonical import INITIAL_SCALE
 from graings.scene.children import Children
 from graings.scene.encoding import encoding_width, frequency_encoding
-from graings.scene.perceptron import Shared, perceptron, weights_and_biases
+from graings.scene.perceptron import GroupBias, perceptron, weights_and_biases
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,9 +43,9 @@ def deformation_from(raw: Float[Tensor, "gaussian 10"], extent: float) -> Deform
 class DeformationNetwork(nn.Module):
     """(position, gamma(t)) -> raw offsets [N, 10]; exactly zero at birth.
 
-    With `deform_time` product it is W (phi(x) * psi(gamma(t))) + b: the hidden layers say which of `deform_width`
-    motions a position takes part in, psi how far each has gone. All positions of a frame share psi, so it costs one
-    row. With `deform_time` input the encoded time is a further input of the first layer, as a bias for the same reason.
+    With `time_conditioning` factorized it is W (phi(x) * psi(gamma(t))) + b: the hidden layers give each position its
+    weights on `deform_width` motions, psi the amplitude of each motion at the time. All positions of a frame share
+    psi, so it costs one row. With concatenated the encoded time is a further input of the first layer, added as a bias.
     """
 
     def __init__(self, config: SceneConfig) -> None:
@@ -84,7 +84,7 @@ class DeformationNetwork(nn.Module):
 def time_modules(config: SceneConfig) -> tuple[nn.Linear | None, nn.Sequential | None]:
     """What encoded time goes through: to the first layer as a bias, or to the last one as weights; one of the two."""
     width, time_width = config.deform_width, encoding_width(1, config.time_frequencies)
-    if config.deform_time == "input":
+    if config.time_conditioning == "concatenated":
         return nn.Linear(time_width, width, bias=False), None
     hidden = config.time_width
     return None, nn.Sequential(nn.Linear(time_width, hidden), nn.ReLU(), nn.Linear(hidden, width))
@@ -134,4 +134,4 @@ class SingleMLP(nn.Module):
         if moment is not None and self.psi is not None:
             canonical, temporal = weights[-1].split([7, 10])
             weights[-1] = torch.cat([canonical, temporal * self.psi(moment)])
-        return perceptron(torch.cat(everything, dim=1), weights, biases, shared=Shared(shared, drawn.anchors))
+        return perceptron(torch.cat(everything, dim=1), weights, biases, shared=GroupBias(shared, drawn.anchors))

@@ -36,7 +36,7 @@ def frequency_encoding(x: Float[Tensor, "*batch dim"], octaves: int) -> Float[Te
     if x.requires_grad and torch.is_grad_enabled():
         return plain_frequency_encoding(x, octaves)
     encoded = x.new_empty(*x.shape[:-1], encoding_width(x.shape[-1], octaves))
-    kernel.kernel().encode(x.detach().contiguous(), x.shape[-1], octaves, encoded, kernel.threads())
+    kernel.kernel().encode(x.detach().contiguous(), x.shape[-1], octaves, encoded, kernel.thread_count())
     return encoded
 
 
@@ -71,7 +71,7 @@ def direction_encoding(
     """
     if directions.requires_grad and torch.is_grad_enabled():
         return plain_direction_encoding(directions, degree, normals)
-    encoded: Tensor = _Directions.apply(directions, normals, degree, kernel.threads())  # type: ignore[no-untyped-call]
+    encoded: Tensor = _Directions.apply(directions, normals, degree, kernel.thread_count())  # type: ignore[no-untyped-call]
     return encoded
 
 

@@ -18,7 +18,7 @@ from torch.nn import functional
 from graings import kernel
 
 
-class Shared(NamedTuple):
+class GroupBias(NamedTuple):
     """What rows have in common: `values` are added to the first layer of the rows of a group, `groups` ascend."""
 
     values: Float[Tensor, "group first"]
@@ -30,7 +30,7 @@ def perceptron(
     weights: Sequence[Float[Tensor, "_ _"]],
     biases: Sequence[Float[Tensor, " _"]],
     *,
-    shared: Shared | None = None,
+    shared: GroupBias | None = None,
     threads: int | None = None,
 ) -> Float[Tensor, "row output"]:
     """W_n relu(... relu(W_1 x + s + b_1) ...) + b_n for each row x; weights are [out, in] as torch's.
@@ -63,7 +63,7 @@ def perceptron(
         tensors.append(shared.values)
     if any(t.dtype != kind or t.device.type != "cpu" for t in tensors):
         raise ValueError(f"inputs, weights, biases and shared values must all be {kind} on the CPU")
-    workers = kernel.threads() if threads is None else threads
+    workers = kernel.thread_count() if threads is None else threads
     if workers < 1:
         raise ValueError(f"threads must be at least 1, got {workers}")
     values: Tensor = _Perceptron.apply(workers, groups, *tensors)  # type: ignore[no-untyped-call]
@@ -75,7 +75,7 @@ def plain_perceptron(
     weights: Sequence[Float[Tensor, "_ _"]],
     biases: Sequence[Float[Tensor, " _"]],
     *,
-    shared: Shared | None = None,
+    shared: GroupBias | None = None,
 ) -> Float[Tensor, "row output"]:
     """The oracle of `perceptron`: the same chain as torch writes it, layer by layer."""
     values = functional.linear(inputs, weights[0], biases[0])

@@ -18,17 +18,17 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from graings import constants
-from graings.camera import Sampling
+from graings.camera.sampling_rate import SamplingRate
 from graings.config import SceneConfig
 from graings.gaussians import Gaussians
+from graings.random import torch_stream
 from graings.scene.appearance import CanonicalAppearance, ResidualField
-from graings.scene.canonical import StaticMLP, unlearned
+from graings.scene.canonical import StaticMLP, default_geometry
 from graings.scene.children import Children, compose, gather
 from graings.scene.clip import clip
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP, deformation_from
 from graings.scene.saturate import tanh
 from graings.scene.scaffold import Scaffold
-from graings.seeds import global_stream
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class Composition:
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
     opacities: Float[Tensor, "anchor child"]  # score of every slot, o(t) where it may be drawn at all; no gradient
     blur: float  # low-pass that the Gaussians were trained to be seen with, px^2 where a view is as fine as `sampling`
-    sampling: Sampling
+    sampling: SamplingRate
 
 
 class Scene(nn.Module):
@@ -64,7 +64,7 @@ class Scene(nn.Module):
         scaffold: Scaffold,
         *,
         extent: float,
-        sampling: Sampling,
+        sampling: SamplingRate,
         initial_opacity: float,
         seed: int = 0,
     ) -> None:
@@ -79,19 +79,19 @@ class Scene(nn.Module):
         self.static: StaticMLP | None = None
         self.deformation: DeformationNetwork | None = None
         # Each network begins with the same weights whichever others there are: ablations differ by their part alone.
-        with global_stream(seed, "init.appearance"):
+        with torch_stream(seed, "init.appearance"):
             self.appearance = CanonicalAppearance(config, initial_opacity)
         if config.residual:
-            with global_stream(seed, "init.residual"):
+            with torch_stream(seed, "init.residual"):
                 self.residual = ResidualField(config)
         if config.single_mlp:
-            with global_stream(seed, "init.single"):
+            with torch_stream(seed, "init.single"):
                 self.single = SingleMLP(config)
         elif config.canonical:
-            with global_stream(seed, "init.static"):
+            with torch_stream(seed, "init.static"):
                 self.static = StaticMLP(config)
         if not config.single_mlp and config.deformation != "none":
-            with global_stream(seed, "init.deformation"):
+            with torch_stream(seed, "init.deformation"):
                 self.deformation = DeformationNetwork(config)
 
     def gaussians(self, eye: ArrayLike, time: float) -> Gaussians:
@@ -113,12 +113,12 @@ class Scene(nn.Module):
         times = [time for _, time in views]
 
         residual = self.residual if self.temporal else None
-        lasting = self._lasting(directions)
-        awake = _awake(lasting, 0.0 if residual is None else residual.scale)
-        features = scaffold.features.index_select(0, awake)
+        lasting = self._canonical_opacities(directions)
+        active = _active_anchors(lasting, 0.0 if residual is None else residual.scale)
+        features = scaffold.features.index_select(0, active)
         source = features.detach() if config.residual_stop_gradient else features
-        scores = [score.index_select(0, awake) for score in lasting]
-        directions = [towards.index_select(0, awake) for towards in directions]
+        scores = [score.index_select(0, active) for score in lasting]
+        directions = [towards.index_select(0, active) for towards in directions]
         changes: list[Tensor | None] = [None] * len(views)
         if residual is not None:
             changes = [
@@ -131,13 +131,13 @@ class Scene(nn.Module):
             ]
         drawn_anywhere = torch.stack([score.detach() for score in scores]).amax(0).flatten() > constants.ALPHA_MIN
         places = drawn_anywhere.nonzero().squeeze(-1)  # of what is drawn among the slots of awake anchors
-        children = awake[places // slots] * slots + places % slots
+        children = active[places // slots] * slots + places % slots
 
         drawn = gather(scaffold, children)
         uids = scaffold.child_uids(children)
         extent = float(self.extent)
         compositions = []
-        answers = self._answers(drawn, children, times)
+        answers = self._predicted_geometry(drawn, children, times)
         every = zip(lasting, scores, changes, directions, answers, strict=True)
         for unchanged, score, change, towards, (canonical, raw) in every:
             colors = self.appearance.colors(features, towards, places)
@@ -155,7 +155,7 @@ class Scene(nn.Module):
                 uids=uids,
             )
             moved = None if raw is None else deformation_from(raw, extent)
-            opacities = unchanged.detach().index_copy(0, awake, score.detach())
+            opacities = unchanged.detach().index_copy(0, active, score.detach())
             compositions.append(
                 Composition(
                     gaussians, children, drawn.centres, moved, drawn_change, opacities, config.blur, self.sampling
@@ -163,7 +163,7 @@ class Scene(nn.Module):
             )
         return compositions
 
-    def _lasting(self, directions: Sequence[Tensor]) -> list[Tensor]:
+    def _canonical_opacities(self, directions: Sequence[Tensor]) -> list[Tensor]:
         """Of each view: the opacity score [A, k] of every slot before the residual field has spoken."""
         offsets = self.scaffold.opacity_offsets.unsqueeze(-1)
         scores: list[Tensor] = []
@@ -192,22 +192,26 @@ class Scene(nn.Module):
         if self.single is not None:
             raw = self._single(self.single, gather(self.scaffold, children), canonical_means, time)[:, 7:]
         else:
-            raw = self._moved(children, canonical_means, [time])[0]
+            raw = self._predicted_deformation(children, canonical_means, [time])[0]
         return deformation_from(raw, float(self.extent))
 
-    def _answers(self, drawn: Children, children: Tensor, times: Sequence[float]) -> list[tuple[Tensor, Tensor | None]]:
+    def _predicted_geometry(
+        self, drawn: Children, children: Tensor, times: Sequence[float]
+    ) -> list[tuple[Tensor, Tensor | None]]:
         """What the networks say of the drawn children at each time: canonical geometry, and its change if it moves."""
         if self.single is not None:
             if not self.temporal:
                 return [(self._single(self.single, drawn, drawn.centres, None)[:, :7], None)] * len(times)
             every = [self._single(self.single, drawn, drawn.centres, time) for time in times]
             return [(raw[:, :7], raw[:, 7:]) for raw in every]
-        canonical = unlearned(drawn.centres) if self.static is None else self.static(self.scaffold.features, drawn)
+        canonical = (
+            default_geometry(drawn.centres) if self.static is None else self.static(self.scaffold.features, drawn)
+        )
         if not self.temporal or self.deformation is None:
             return [(canonical, None)] * len(times)
-        return [(canonical, raw) for raw in self._moved(children, drawn.centres, times)]
+        return [(canonical, raw) for raw in self._predicted_deformation(children, drawn.centres, times)]
 
-    def _moved(self, children: Tensor, canonical_means: Tensor, times: Sequence[float]) -> list[Tensor]:
+    def _predicted_deformation(self, children: Tensor, canonical_means: Tensor, times: Sequence[float]) -> list[Tensor]:
         """DeformNet's answer per child at each time, or one per anchor that all its children share."""
         assert self.deformation is not None
         moments = torch.tensor(times, dtype=canonical_means.dtype).unsqueeze(-1)
@@ -227,7 +231,7 @@ class Scene(nn.Module):
         return (canonical_means.detach() if self.config.stop_gradient else canonical_means) / self.extent
 
 
-def _awake(lasting: Sequence[Float[Tensor, "anchor child"]], reach: float) -> Int64[Tensor, " awake"]:
+def _active_anchors(lasting: Sequence[Float[Tensor, "anchor child"]], reach: float) -> Int64[Tensor, " awake"]:
     """Anchors with a child that may be drawn in one of the views: no residual adds more than `reach` to a score."""
     highest = torch.stack([score.detach().amax(-1) for score in lasting]).amax(0)
     return (highest + reach > constants.ALPHA_MIN).nonzero().squeeze(-1)

@@ -24,12 +24,12 @@ QUINTIC: Final = (3.4445, -4.7750, 2.0315)
 ITERATIONS: Final = 5
 
 # A matrix whose norm is below this is taken for nothing and moves less: 1e-15, as for Adam, for each of 1 000 entries.
-NOTHING: Final = 1e-12
+MIN_NORM: Final = 1e-12
 
 # Entries below this share of a matrix's norm count as none. They decide no digit of the step, but a hidden unit that
 # nothing wakes any more leaves momentum that fades by a twentieth a step, for ever, and its fourth powers would be
 # subnormal numbers, each of which costs some CPUs 150 cycles: two hundred milliseconds a step instead of two.
-FADED: Final = 1e-9
+DROP_BELOW: Final = 1e-9
 
 # Root mean square of an Adam update at rate 1, roughly: with it the same rate fits both.
 ADAM_RMS: Final = 0.2
@@ -59,11 +59,11 @@ class Muon:
 def orthogonal(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row column"]:
     """`matrix` with singular values near 1: within 0.4 ... 1.25 those above 1 % of the largest, up to 128 of them.
 
-    A matrix whose norm is below `NOTHING` is scaled by it instead, so 0 stays 0. Source: Jordan et al. 2024.
+    A matrix whose norm is below `MIN_NORM` is scaled by it instead, so 0 stays 0. Source: Jordan et al. 2024.
     """
     # In double precision, in which no square of a single overflows.
     norm = torch.linalg.vector_norm(matrix, dtype=torch.float64)
-    flat = functional.hardshrink((matrix / norm.clamp_min(NOTHING)).to(matrix.dtype), FADED)
+    flat = functional.hardshrink((matrix / norm.clamp_min(MIN_NORM)).to(matrix.dtype), DROP_BELOW)
     upright = flat.shape[0] > flat.shape[1]
     if upright:  # the products of the short side are the cheaper ones
         flat = flat.mT

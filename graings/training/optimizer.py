@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from graings.config import RatesConfig, TrainConfig
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
-from graings.training.guard import Gradient
+from graings.training.guard.guard import Gradient
 from graings.training.muon import Muon
 
 # Rates are those of one view a step; with more they rise by this power of their number. Steps of four views at 1.5
@@ -80,7 +80,7 @@ class Optimizer:
         matrices: list[nn.Parameter] = []
         self._muon_groups: list[str] = []
         for name, parameter in scene.named_parameters():
-            if config.matrix_step == "muon" and _steps_by_muon(name, parameter):
+            if config.matrix_optimizer == "muon" and _steps_by_muon(name, parameter):
                 matrices.append(parameter)
                 self._muon_groups.append(_group_of(name))
             else:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from graings.config import LossConfig
+from graings.random import RandomStreams
 from graings.scene.scene import Composition, Scene
 from graings.training import losses
-from graings.training.streams import Streams
 
 # Rigidity pairs each child with the one at most so many places further on in the order of slots: of its own anchor, or
 # of one born near it.
@@ -25,7 +25,7 @@ REACH = 30
 
 # Only pairs between these distances count, in units of the scene's extent: further apart are other bodies, and of
 # closer ones the length is rounding.
-NEAREST, FARTHEST = 1e-3, 0.2
+MIN_DISTANCE, MAX_DISTANCE = 1e-3, 0.2
 
 # The temporal term looks at no fewer children than about this (decision 10).
 MIN_TEMPORAL_SAMPLE = 2_000
@@ -37,7 +37,7 @@ def regularisers(
     moments: Sequence[float],
     times: NDArray[np.float64],
     config: LossConfig,
-    streams: Streams,
+    streams: RandomStreams,
 ) -> Float[Tensor, ""]:
     """lambda_1 L_temp + lambda_2 L_def + lambda_3 L_res of one step's `compositions`, and rigidity between them.
 
@@ -49,17 +49,17 @@ def regularisers(
     first = compositions[0]
     if len(first.children) == 0:
         return total
-    if first.deformation is not None and config.l_temp and len(times) > 1:
+    if first.deformation is not None and config.temporal > 0 and len(times) > 1:
         share = config.temporal_share
         generator = streams["time_pairs"]
-        total = total + config.gain * config.temporal * _temporal(scene, first, moments[0], times, share, generator)
-    if config.l_rigid and config.rigidity > 0:
+        total = total + config.temporal * _temporal(scene, first, moments[0], times, share, generator)
+    if config.rigidity > 0:
         total = total + config.rigidity * _rigidity(compositions, float(scene.extent), streams["child_pairs"])
     for one in compositions:
-        if one.deformation is not None and config.l_def:
-            total = total + config.gain * config.deformation * losses.deformation(one.deformation) / len(compositions)
-        if one.residual is not None and config.l_res:
-            total = total + config.gain * config.residual * losses.residual(one.residual) / len(compositions)
+        if one.deformation is not None and config.deformation > 0:
+            total = total + config.deformation * losses.deformation(one.deformation) / len(compositions)
+        if one.residual is not None and config.residual > 0:
+            total = total + config.residual * losses.residual(one.residual) / len(compositions)
     return total
 
 
@@ -94,9 +94,9 @@ def _rigidity(compositions: Sequence[Composition], extent: float, generator: tor
     if len(offsets) < 2 or len(canonical) <= step:
         return torch.zeros(())
     gaps = [((places := canonical + offset)[step:] - places[:-step]) / extent for offset in offsets]
-    lengths = torch.stack([(gap.square().sum(-1) + NEAREST**2 / 4).sqrt() for gap in gaps])
+    lengths = torch.stack([(gap.square().sum(-1) + MIN_DISTANCE**2 / 4).sqrt() for gap in gaps])
     mean = lengths.detach().mean(0)
     # A child that another view draws may be below zero in this one, and a negative weight would reward strain.
     opacities = torch.stack([one.gaussians.opacities.detach() for one in compositions]).amin(0).clamp_min(0.0)
-    weights = torch.minimum(opacities[step:], opacities[:-step]) * ((mean > NEAREST) & (mean < FARTHEST))
+    weights = torch.minimum(opacities[step:], opacities[:-step]) * ((mean > MIN_DISTANCE) & (mean < MAX_DISTANCE))
     return losses.rigidity(lengths, weights)

@@ -15,11 +15,18 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from graings.capture.backdrop import with_background
+from graings.capture.background import with_background
 from graings.capture.capture import SPLITS, Capture, Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
-from graings.checkpoint import (
+from graings.config import TrainConfig, restored
+from graings.errors import CheckpointError, DivergedError
+from graings.evaluation.evaluate import evaluate, subset
+from graings.evaluation.metrics import Lpips, SplitMetrics
+from graings.kernel import use_threads
+from graings.plan.plan import Plan, make_plan
+from graings.report.report import read_metrics
+from graings.storage.checkpoint import (
     TrainingState,
     best_checkpoint,
     load_model,
@@ -28,21 +35,14 @@ from graings.checkpoint import (
     newest_checkpoint,
     save_checkpoint,
 )
-from graings.compact import read_compact, write_compact
-from graings.config import TrainConfig, restored_training
-from graings.errors import CheckpointError, DivergedError
-from graings.evaluation import evaluate, subset
-from graings.metrics import Lpips, SplitMetrics
-from graings.plan import Plan, make_plan
-from graings.report import read_metrics
-from graings.run_folder import MODEL_FILE, RECORD_FILE, read_record, sole_trainer
-from graings.threads import use_threads
-from graings.training import lost
-from graings.training.attempt import Attempt
-from graings.training.journal import EvaluationPoint, Journal
-from graings.training.pace import Clock, Rate, evaluation_marks
-from graings.training.stiffness import Stiffness, subpixel_share
+from graings.storage.compact import read_compact, write_compact
+from graings.storage.run_folder import MODEL_FILE, RECORD_FILE, read_record, sole_trainer
+from graings.training.curriculum import missing_motion
+from graings.training.curriculum.restart import RestartState
+from graings.training.guard.stiffness import Stiffness, subpixel_share
+from graings.training.timing import Clock, Rate, evaluation_marks
 from graings.training.trainer import StepReport, Trainer
+from graings.training.training_log import EvaluationPoint, TrainingLog
 
 LOG = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class TrainingRun:
         config: TrainConfig,
         threads: int | None,
         clock: Clock,
-        attempt: Attempt | None = None,
+        attempt: RestartState | None = None,
     ) -> None:
         self.folder = folder
         self.capture = capture
@@ -77,13 +77,13 @@ class TrainingRun:
         seen = with_background(config.capture, capture)
         self.applied = self.plan.apply(config).model_copy(update={"capture": seen})
         self.images = ImageStore(seen.background_rgb(), seen.cache_mb)
-        self._journal = Journal(folder, capture, config, self.plan, clock)
-        self._begin(attempt or Attempt())
+        self._journal = TrainingLog(folder, capture, config, self.plan, clock)
+        self._begin(attempt or RestartState())
         clock.add("init", time.perf_counter() - started, time.process_time() - computed)
 
-    def _begin(self, attempt: Attempt) -> None:
+    def _begin(self, attempt: RestartState) -> None:
         self._attempt = attempt
-        self._trainer = Trainer(self.capture, self.images, attempt.config(self.applied), attempt.began)
+        self._trainer = Trainer(self.capture, self.images, attempt.config(self.applied), attempt.iterations_before)
         self._best_psnr: float | None = None
 
     @classmethod
@@ -111,7 +111,7 @@ class TrainingRun:
         run or the capture is another one.
         """
         record = read_record(folder)
-        config = restored_training(record.config, folder / RECORD_FILE)
+        config = restored(TrainConfig, record.config, folder / RECORD_FILE)
         clock = Clock()
         started = time.perf_counter()
         data = load_capture(capture or record.capture, config.capture)
@@ -122,7 +122,7 @@ class TrainingRun:
             return cls(folder, data, config, threads, clock)
         model, state = load_training(folder)
         with _intact(model.path):
-            attempt = Attempt.of(state.facts)
+            attempt = RestartState.of(state.facts)
         run = cls(folder, data, config, threads, clock, attempt)
         with _intact(model.path):
             run._trainer.load(model.scene, state.tensors, state.facts["trainer"])
@@ -133,12 +133,12 @@ class TrainingRun:
     @property
     def iteration(self) -> int:
         """Iterations done."""
-        return self._attempt.began + self._trainer.iteration
+        return self._attempt.iterations_before + self._trainer.iteration
 
     @property
     def iterations(self) -> int:
         """Iterations wanted."""
-        return self._attempt.began + self.config.iterations
+        return self._attempt.iterations_before + self.config.iterations
 
     @property
     def metrics_path(self) -> Path:
@@ -208,20 +208,20 @@ class TrainingRun:
         """
         trainer = self._trainer
         chosen = self.applied.time_window is not None or trainer.window.share(1) < 1
-        if self.iteration != lost.look_at(self.applied) or self._attempt.began > 0 or chosen:
+        if self.iteration != missing_motion.look_at(self.applied) or self._attempt.iterations_before > 0 or chosen:
             return ()
-        part = lost.part_of_clip(self.applied, [frame.time for frame in self.capture.train])
+        part = missing_motion.restart_window(self.applied, [frame.time for frame in self.capture.train])
         if part is None or not trainer.scene.temporal:
             return ()
         started, computed = time.perf_counter(), time.process_time()
-        frames = subset(self.capture.train, lost.VIEWS)
-        share = lost.lost_share(trainer.scene, frames, self.images, trainer.background)
+        frames = subset(self.capture.train, missing_motion.VIEWS)
+        share = missing_motion.missing_fraction(trainer.scene, frames, self.images, trainer.background)
         said: tuple[str, ...] = ()
-        if share > lost.MANY:
-            self._begin(Attempt(self.iteration, part))
+        if share > missing_motion.MAX_MISSING_FRACTION:
+            self._begin(RestartState(self.iteration, part))
             said = (
                 f"time_window: begins again, in the middle of the clip: in {share:.0%} of the views something large "
-                "that moves was lost. `time_window=1` keeps what there is.",
+                "that moves was missing_motion. `time_window=1` keeps what there is.",
             )
             self._journal.note(self.iteration, said)
         self._journal.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
@@ -358,14 +358,14 @@ def _intact(checkpoint: Path) -> Iterator[None]:
         ) from error
 
 
-def _psnr_of_best(folder: Path, attempt: Attempt) -> float | None:
+def _psnr_of_best(folder: Path, attempt: RestartState) -> float | None:
     """Held-out PSNR of the best checkpoint of `attempt` so far; None where none can be read."""
     best = best_checkpoint(folder)
     if best is None:
         return None
     try:
         facts = load_state(best).facts
-        return float(facts["curve"][-1]["psnr"]) if Attempt.of(facts) == attempt else None
+        return float(facts["curve"][-1]["psnr"]) if RestartState.of(facts) == attempt else None
     except (CheckpointError, KeyError, IndexError, TypeError, ValueError) as error:
         LOG.warning("%s: cannot be read (%s). The next evaluation takes its place.", best, error)
         return None

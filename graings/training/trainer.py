@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,51 +20,32 @@ from torch.nn import functional
 from graings.capture.capture import Capture, Frame
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
+from graings.config.schedule import Phase, phases
 from graings.errors import DivergedError
+from graings.random import RandomStreams
 from graings.raster.photometric import photometric
 from graings.raster.result import RenderResult
 from graings.render import draw, low_pass
 from graings.scene.scene import Composition, Scene
 from graings.training import losses
-from graings.training.average import Average
-from graings.training.collapse import SCORE, Collapse, mend
-from graings.training.density_control import DensityControl
-from graings.training.guard import Gradient, Guard, first_not_finite
-from graings.training.initialize import make_scene
+from graings.training.curriculum.image_pyramid import ImagePyramid
+from graings.training.curriculum.time_window import TimeWindow
+from graings.training.density.control import DensityControl
+from graings.training.guard.collapse import RESET_OPACITY, Collapse, raise_opacity
+from graings.training.guard.guard import Gradient, Guard, first_not_finite
+from graings.training.guard.snapshots import Snapshots
+from graings.training.guard.stiffness import step_over_size
+from graings.training.initialization.initial_scene import make_scene
 from graings.training.optimizer import Optimizer
-from graings.training.pyramid import Pyramid
+from graings.training.parameter_average import ParameterAverage
 from graings.training.regularisers import regularisers
-from graings.training.snapshots import Snapshots
-from graings.training.stiffness import step_over_size
-from graings.training.streams import Streams, ViewSampler
-from graings.training.time_window import TimeWindow
+from graings.training.view_sampler import ViewSampler
 
 # Every time training goes back, it goes on with this share of the rates.
 RATE_CUT = 0.5
 
 # What the guard calls the gradients of the projected centres, which growth looks at.
 SCREEN = "screen"
-
-
-@dataclass(frozen=True, slots=True)
-class Phase:
-    """Iterations `first` to `last` (inclusive, from 1); `temporal` switches the time modules on."""
-
-    name: Literal["warmup", "joint", "static"]
-    first: int
-    last: int
-    temporal: bool
-
-
-def phases(config: TrainConfig) -> tuple[Phase, ...]:
-    """The schedule of a run: static warm-up then joint training, or one static phase."""
-    scene = config.scene
-    has_time = scene.residual or scene.single_mlp or scene.deformation != "none"
-    if not has_time:
-        return (Phase("static", 1, config.iterations, temporal=False),)
-    warmup = config.scaled(config.warmup) if scene.canonical else 0
-    joint = Phase("joint", warmup + 1, config.iterations, temporal=True)
-    return (Phase("warmup", 1, warmup, temporal=False), joint) if warmup else (joint,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +82,7 @@ class Trainer:
         self.config = config
         self.background = config.capture.background_rgb()
         self.phases = phases(config)
-        self.streams = Streams(config.seed)
+        self.streams = RandomStreams(config.seed)
         self.sampler = ViewSampler(len(capture.train), self.streams["sampler"])
         self.times = capture.times
         self.iteration = 0
@@ -109,7 +90,7 @@ class Trainer:
         self.scene = start.scene
         self.start_notes = start.notes
         self.window = TimeWindow(config, [frame.time for frame in capture.train], start.time_window)
-        self.pyramid = Pyramid(config, capture.train, float(self.scene.extent))
+        self.pyramid = ImagePyramid(config, capture.train, float(self.scene.extent))
         self.snapshots = Snapshots()
         self._attach(start.voxel_size)
 
@@ -120,7 +101,7 @@ class Trainer:
         self.density = DensityControl(self.config, self.scene, voxel_size)
         self.guard = Guard(self.config.guard)
         self.collapse = Collapse()
-        self.average = Average()
+        self.average = ParameterAverage()
         self.step_over_size: float | None = None  # of the last step that was measured and stands
 
     def __iter__(self) -> Iterator[StepReport]:
@@ -171,8 +152,8 @@ class Trainer:
         gradients += [Gradient("the projected centres", SCREEN, o.grad) for o in offsets if o.grad is not None]
         errors = [float(functional.mse_loss(r.color.detach(), t)) for r, t in zip(results, targets, strict=True)]
         # Compared with the losses of steps before squares joined in.
-        verdict = self.guard.judge(self.iteration, loss.detach() - squared * statistics.mean(errors), gradients)
-        if verdict.culprit is None:
+        verdict = self.guard.check_step(self.iteration, loss.detach() - squared * statistics.mean(errors), gradients)
+        if verdict.non_finite is None:
             for group, (norm, limit) in verdict.limits.items():
                 events.append(f"clipped: gradients of {group} at {norm:.3g} limited to {limit:.3g} on {names}")
                 if group != SCREEN:
@@ -194,7 +175,7 @@ class Trainer:
         else:
             self.optimizer.clear()
             moments = ", ".join(f"{frame.time:.4g}" for frame in frames)
-            events.append(f"skipped: {verdict.culprit} was not finite on {names} at t = {moments}")
+            events.append(f"skipped: {verdict.non_finite} was not finite on {names} at t = {moments}")
         events += self._adapt()
         events += self._watch(len(children), float(differences.detach().amax()))
         self._settle()
@@ -246,7 +227,7 @@ class Trainer:
         if (share := self.window.share(1)) < 1:
             events.append(f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens")
         if (times := self.pyramid.at(1).times) > 1:
-            events.append(f"small_until: begins with pictures of 1/{times} of their width and height")
+            events.append(f"low_resolution_until: begins with pictures of 1/{times} of their width and height")
         return events
 
     def _look(self) -> None:
@@ -295,11 +276,11 @@ class Trainer:
         last_of_pass = not self._upcoming()
         if self.collapse.observe(drawn, scaffold.count * scaffold.slots, difference, last_of_pass=last_of_pass):
             problem = problem or self._lost()
-            if problem is None and not self.collapse.mended:
-                shift = mend(self.scene)
-                self.collapse.mended = True
+            if problem is None and not self.collapse.raised:
+                shift = raise_opacity(self.scene)
+                self.collapse.raised = True
                 events.append(
-                    f"opacity_rebias: nothing was drawn any more; scores raised to {SCORE} ({shift:+.3g}). "
+                    f"opacity_rebias: nothing was drawn any more; scores raised to {RESET_OPACITY} ({shift:+.3g}). "
                     "Where things move far, train with a smaller `time_window`."
                 )
             elif problem is None and self.collapse.missed:  # where the pictures are empty, so may the scene be
@@ -347,14 +328,14 @@ class Trainer:
                 f"{self.guard.rollbacks} times: {problem}. The best model is kept. "
                 "Train again with smaller rates (`rates`)."
             )
-        iteration, before, mended = self.iteration, self.guard, self.collapse.mended
+        iteration, before, raised = self.iteration, self.guard, self.collapse.raised
         snapshot = self.snapshots.back()
         self.load(copy.deepcopy(snapshot.scene), snapshot.tensors, snapshot.facts)
         self.iteration = iteration
         self.guard.rolled_back(before)
         self.guard.rollbacks += 1
         self._look()
-        self.collapse.mended = mended
+        self.collapse.raised = raised
         self._slow_down()
         self.sampler = self._sampler()
         return (
@@ -410,7 +391,7 @@ class Trainer:
         """Continue from a scene and what `state()` gave with it."""
         self.scene = scene
         # First points found again, with another library or on another CPU, need not have quite the same extent.
-        self.pyramid = Pyramid(self.config, self.capture.train, float(scene.extent))
+        self.pyramid = ImagePyramid(self.config, self.capture.train, float(scene.extent))
         self._attach(float(facts["voxel_size"]))
         parts: dict[str, dict[str, Tensor]] = {
             name: {} for name in ("adam", "statistics", "streams", "sampler", "guard", "average")

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from graings.config import PRESETS, make_config
 from jobs.job import ID_PATTERN, JobSpec
-from service.context import Here, JobId
+from service.context import ContextDep, JobId
 from service.inspection import inspect_capture
 from service.problems import RESPONSES
 from service.schemas import JobPage, JobResource, job_resource
@@ -46,7 +46,7 @@ RETRY_AFTER_S = "2"
 async def submit(
     request: Request,
     response: Response,
-    here: Here,
+    here: ContextDep,
     preset: Annotated[str, Query(description=f"Where defaults come from: {', '.join(PRESETS)}.")] = "standard",
     config: Annotated[
         str | None, Query(description="Options as a JSON object, nested or with dotted keys, see /options.")
@@ -72,7 +72,7 @@ async def submit(
 
 @router.get("", operation_id="list_jobs")
 def page(
-    here: Here,
+    here: ContextDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(pattern=ID_PATTERN, description="From `next` of the page before.")] = None,
 ) -> JobPage:
@@ -83,7 +83,7 @@ def page(
 
 
 @router.get("/{job_id}", operation_id="get_job")
-def get(job_id: JobId, response: Response, here: Here) -> JobResource:
+def get(job_id: JobId, response: Response, here: ContextDep) -> JobResource:
     """A job with its state and progress."""
     job = here.jobs.get(job_id)
     if not job.state.final:
@@ -92,24 +92,24 @@ def get(job_id: JobId, response: Response, here: Here) -> JobResource:
 
 
 @router.post("/{job_id}/cancel", status_code=202, operation_id="cancel_job")
-def cancel(job_id: JobId, here: Here) -> JobResource:
+def cancel(job_id: JobId, here: ContextDep) -> JobResource:
     """Stop a job; it keeps a checkpoint to resume from. Cancelling it again changes nothing."""
     return job_resource(here.jobs.cancel(job_id))
 
 
 @router.post("/{job_id}/resume", status_code=202, operation_id="resume_job")
-def resume(job_id: JobId, here: Here) -> JobResource:
+def resume(job_id: JobId, here: ContextDep) -> JobResource:
     """Queue a cancelled job again; it continues where it stopped. Resuming it again changes nothing."""
     return job_resource(here.jobs.resume(job_id))
 
 
 @router.post("/{job_id}/retry", status_code=202, operation_id="retry_job")
-def retry(job_id: JobId, here: Here) -> JobResource:
+def retry(job_id: JobId, here: ContextDep) -> JobResource:
     """Queue a failed or diverged job again; it continues from its last checkpoint, if any."""
     return job_resource(here.jobs.retry(job_id))
 
 
 @router.delete("/{job_id}", status_code=204, operation_id="delete_job")
-def delete(job_id: JobId, here: Here) -> None:
+def delete(job_id: JobId, here: ContextDep) -> None:
     """Remove a job with its model, log and metrics; its capture too when no other job uses it."""
     here.jobs.delete(job_id)

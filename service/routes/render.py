@@ -13,13 +13,13 @@ from fastapi import APIRouter, Header, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 import graings
-from graings.camera import Camera, View
-from graings.encode import FORMATS, MEDIA_TYPES, ImageFormat
+from graings.camera.camera import Camera, View
+from graings.camera.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
 from graings.errors import CheckpointError
-from graings.model import Model
-from graings.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
+from graings.image_encoding import FORMATS, MEDIA_TYPES, ImageFormat
+from graings.storage.model import Model
 from jobs.job import JobNotFound
-from service.context import Context, Here
+from service.context import Context, ContextDep
 from service.negotiation import preferred
 from service.problems import RESPONSES, BadRequest, NotAcceptable, NotYet
 from service.scenes import Picture
@@ -88,7 +88,7 @@ class RenderQuery(BaseModel):
 @router.get("/render", operation_id="render", response_class=Response, responses={**_IMAGES, **RESPONSES})
 async def render(
     query: Annotated[RenderQuery, Query()],
-    here: Here,
+    here: ContextDep,
     accept: Annotated[str | None, Header()] = None,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:

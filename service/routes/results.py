@@ -13,7 +13,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from jobs.job import Job, JobNotFound, JobState
 from jobs.progress import last_start, read_progress
-from service.context import Here, JobId
+from service.context import ContextDep, JobId
 from service.problems import RESPONSES, NotYet
 from service.schemas import job_resource
 
@@ -25,21 +25,21 @@ _MAX_LOG = 4 << 20
 
 
 @router.get("/metrics", operation_id="get_metrics", response_class=Response)
-def metrics(job_id: JobId, here: Here) -> Response:
+def metrics(job_id: JobId, here: ContextDep) -> Response:
     """The metrics document, schema `graings.metrics/1`; it grows with every evaluation."""
     path = _existing(here.store.folder(job_id).metrics, "metrics", "They come with the first evaluation.")
     return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
 
 
 @router.get("/curve.svg", operation_id="get_curve", response_class=FileResponse)
-def curve(job_id: JobId, here: Here) -> Response:
+def curve(job_id: JobId, here: ContextDep) -> Response:
     """Held-out error against training time, as a picture."""
     path = _existing(here.store.folder(job_id).curve, "curve", "It comes with the first evaluation.")
     return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
 
 
 @router.get("/report", operation_id="get_report", response_class=Response)
-def report(job_id: JobId, here: Here) -> Response:
+def report(job_id: JobId, here: ContextDep) -> Response:
     """The work-precision report, schema `graings.work_precision/1`: error against time, iterations and Gaussians."""
     file = here.store.folder(job_id).report / "work_precision.json"
     path = _existing(file, "report", "It comes with the first evaluation.")
@@ -47,7 +47,7 @@ def report(job_id: JobId, here: Here) -> Response:
 
 
 @router.get("/report.svg", operation_id="get_report_picture", response_class=FileResponse)
-def report_picture(job_id: JobId, here: Here) -> Response:
+def report_picture(job_id: JobId, here: ContextDep) -> Response:
     """The work-precision report as a picture."""
     file = here.store.folder(job_id).report / "training.svg"
     path = _existing(file, "report", "It comes with the first evaluation.")
@@ -55,14 +55,14 @@ def report_picture(job_id: JobId, here: Here) -> Response:
 
 
 @router.get("/model", operation_id="get_model", response_class=FileResponse)
-def model(job_id: JobId, here: Here) -> Response:
+def model(job_id: JobId, here: ContextDep) -> Response:
     """The trained model as one small file, for `graings render`."""
     path = _existing(here.store.folder(job_id).model, "model", "It comes when training ends.")
     return FileResponse(path, media_type="application/octet-stream", filename=f"{job_id}.graings")
 
 
 @router.get("/log", operation_id="get_log", response_class=PlainTextResponse)
-def log(job_id: JobId, here: Here, tail: Annotated[int, Query(ge=1, le=100_000)] = 1_000) -> Response:
+def log(job_id: JobId, here: ContextDep, tail: Annotated[int, Query(ge=1, le=100_000)] = 1_000) -> Response:
     """The last `tail` lines of the trainer's log."""
     path = here.store.folder(job_id).log
     if not path.exists():
@@ -73,7 +73,7 @@ def log(job_id: JobId, here: Here, tail: Annotated[int, Query(ge=1, le=100_000)]
     return PlainTextResponse(b"".join(lines[-tail:]).decode("utf-8", "replace"))
 
 
-def _known(job_id: JobId, here: Here) -> Job:
+def _known(job_id: JobId, here: ContextDep) -> Job:
     """Looked up before the stream begins: afterwards it is too late for a 404."""
     return here.jobs.get(job_id)
 
@@ -81,7 +81,7 @@ def _known(job_id: JobId, here: Here) -> Job:
 @router.get("/events", operation_id="get_events", response_class=EventSourceResponse)
 async def events(
     request: Request,
-    here: Here,
+    here: ContextDep,
     job: Annotated[Job, Depends(_known)],
     last_event_id: Annotated[
         int | None, Header(ge=0, description="Go on after this event; 0 starts at the first report.")

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, Response
 
 from graings.config import options
-from service.context import Here
+from service.context import ContextDep
 from service.problems import AWAY, RESPONSES, problem
 from service.schemas import Readiness
 
@@ -42,7 +42,7 @@ async def health() -> dict[str, str]:
 
 
 @router.get("/readyz", operation_id="get_readiness", response_model=Readiness, responses=RESPONSES)
-def readiness(request: Request, here: Here) -> Readiness | Response:
+def readiness(request: Request, here: ContextDep) -> Readiness | Response:
     """The database answers and the disk has room."""
     found = Readiness(ready=True, workers=here.leases.alive(), waiting=here.jobs.waiting(), free_mb=here.free_mb())
     if found.free_mb < here.settings.min_free_mb:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from graings.checkpoint import load_model
-from graings.cli import main
-from graings.progress import TrainingProgress
+from graings.cli.main import main
+from graings.cli.progress import TrainingProgress
+from graings.storage.checkpoint import load_model
 from tests.ablation.tiny import SETTINGS, table
 
 

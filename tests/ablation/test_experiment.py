@@ -14,8 +14,8 @@ import pytest
 from graings.ablation.experiment import Ablation
 from graings.ablation.rows import ROWS
 from graings.capture.synthetic import write_synthetic
-from graings.checkpoint import load_model
 from graings.errors import CaptureError, CheckpointError, ConfigError
+from graings.storage.checkpoint import load_model
 from tests.ablation.tiny import SETTINGS, table
 
 NAMES = [row.name for row in ROWS]

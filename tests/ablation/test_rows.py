@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from graings.ablation.rows import METHOD, ROWS, chosen_rows, row_config
-from graings.config import Part, make_config
+from graings.config import ConfigSection, make_config
 from graings.errors import ConfigError
 from tests.models import EYE, tiny_scene
 
@@ -16,13 +16,13 @@ from tests.models import EYE, tiny_scene
 CHANGES = {
     "full": {},
     "no_stop_gradient": {"scene.stop_gradient": False},
-    "no_l_temp": {"loss.l_temp": False},
-    "no_l_def": {"loss.l_def": False},
-    "no_l_res": {"loss.l_res": False},
+    "no_l_temp": {"loss.temporal": 0.0},
+    "no_l_def": {"loss.deformation": 0.0},
+    "no_l_res": {"loss.residual": 0.0},
     "single_mlp": {"scene.single_mlp": True},
     "no_residual": {"scene.residual": False},
     "no_canonical": {"scene.canonical": False},
-    "no_rigidity": {"loss.l_rigid": False},
+    "no_rigidity": {"loss.rigidity": 0.0},
     "anchor_deformation": {"scene.deformation": "anchor"},
 }
 
@@ -41,11 +41,11 @@ PAPER = {
 }
 
 
-def flat(part: Part, prefix: str = "") -> dict[str, Any]:
+def flat(part: ConfigSection, prefix: str = "") -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name in type(part).model_fields:
         value = getattr(part, name)
-        values |= flat(value, f"{prefix}{name}.") if isinstance(value, Part) else {f"{prefix}{name}": value}
+        values |= flat(value, f"{prefix}{name}.") if isinstance(value, ConfigSection) else {f"{prefix}{name}": value}
     return values
 
 
@@ -76,7 +76,7 @@ def test_a_setting_that_contradicts_a_row_is_refused_and_one_that_agrees_is_not(
 
 @pytest.mark.parametrize(
     ("name", "key"),
-    [("no_l_temp", "loss.temporal"), ("no_l_def", "loss.gain"), ("no_residual", "scene.residual_scale")],
+    [("no_l_temp", "loss.temporal"), ("no_l_def", "loss.deformation"), ("no_residual", "scene.residual_scale")],
 )
 def test_a_row_that_would_be_the_full_model_over_again_is_refused(name: str, key: str) -> None:
     with pytest.raises(ConfigError, match=rf"{key}: is 0.*{name}"):

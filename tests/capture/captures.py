@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 import pycolmap
 from numpy.typing import NDArray
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig

@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 import pytest
 from numpy.typing import NDArray
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.capture.capture import Frame
 from graings.capture.image_file import check_image
 from graings.capture.images import ImageStore, shrink

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.capture.load import load_capture
 from graings.capture.normalize import frame_of_reference, vertical
 from tests.capture.captures import entry, orbit, pixels, write_dnerf, write_image, write_transforms

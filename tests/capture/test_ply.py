@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from graings.capture.ply import read_ply
+from graings.capture.readers.ply import read_ply
 from graings.errors import CaptureError
 
 PLACE = "property float x\nproperty double y\nproperty float z\n"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import SyntheticScene, write_synthetic

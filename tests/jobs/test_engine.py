@@ -35,7 +35,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def state(engine: Engine, job_id: str) -> JobState:
-    return engine.tickets([job_id])[job_id].state
+    return engine.entries([job_id])[job_id].state
 
 
 def test_the_database_keeps_a_write_ahead_log(tmp_path: Path, engine: Engine) -> None:
@@ -58,12 +58,12 @@ def test_jobs_run_by_priority_and_end_as_their_outcome_says(engine: Engine) -> N
     with executing(engine.url, "worker-a", 1, run):
         until(lambda: engine.waiting() == 0 and not engine.running())
     assert order == ["succeeded", "broken", "failed", "diverged"]
-    tickets = engine.tickets(order)
-    assert {one: tickets[one].state.value for one in order} == {
+    entries = engine.entries(order)
+    assert {one: entries[one].state.value for one in order} == {
         "succeeded": "succeeded", "failed": "failed", "diverged": "diverged", "broken": "failed",
     }  # fmt: skip
-    assert tickets["failed"].error == "because failed"
-    assert "no such luck" in (tickets["broken"].error or "")
+    assert entries["failed"].error == "because failed"
+    assert "no such luck" in (entries["broken"].error or "")
 
 
 def test_a_job_can_be_cancelled_requeued_and_rewound_but_runs_under_its_own_limit(engine: Engine) -> None:

@@ -170,7 +170,7 @@ def test_everything_asked_of_the_queue_fails_at_once_while_the_database_is_away(
     engine.enqueue("a", 10)
     questions: list[Callable[[], object]] = [
         lambda: engine.enqueue("b", 10),
-        lambda: engine.tickets(["a"]),
+        lambda: engine.entries(["a"]),
         engine.running,
         engine.waiting,
         lambda: engine.cancel("a"),
@@ -182,7 +182,7 @@ def test_everything_asked_of_the_queue_fails_at_once_while_the_database_is_away(
         for answer in [pool.submit(question) for question in questions]:
             with pytest.raises(JobError, match="does not answer"):
                 answer.result(10)
-    assert engine.tickets(["a", "b"]).keys() == {"a"}
+    assert engine.entries(["a", "b"]).keys() == {"a"}
     engine.delete("a")
     engine.close()
 

@@ -9,8 +9,8 @@ from typing import NoReturn
 import pytest
 
 from graings.capture.synthetic import write_synthetic
-from graings.checkpoint import load_model
 from graings.config import make_config
+from graings.storage.checkpoint import load_model
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
 from jobs.progress import last_progress, read_progress

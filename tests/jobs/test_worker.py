@@ -21,7 +21,7 @@ from jobs.files import locked
 from jobs.job import Attempt, JobConflict, JobSpec, JobState
 from jobs.queue import JobQueue
 from jobs.store import Store
-from jobs.worker import MAX_CRASHES, MAX_LOSSES, hopeless
+from jobs.worker import MAX_CRASHES, MAX_LOSSES, give_up_reason
 
 LONG_S = 120.0
 # Long enough to be interrupted; what is interrupted starts over from a checkpoint at most 20 iterations back.
@@ -146,13 +146,13 @@ def attempts(*exit_codes: int | None, checkpoint: int = 0, final: bool = False) 
 
 
 def test_a_job_is_given_up_when_attempts_in_a_row_end_badly_at_the_same_checkpoint() -> None:
-    assert hopeless(attempts(*[1] * (MAX_CRASHES - 1)), 0) is None
-    assert "exit code 1" in (hopeless(attempts(*[1] * MAX_CRASHES), 0) or "")
-    assert "memory" in (hopeless(attempts(*[-9] * MAX_CRASHES), 0) or "")
-    assert "worker died" in (hopeless(attempts(*[None] * MAX_LOSSES), 0) or "")
+    assert give_up_reason(attempts(*[1] * (MAX_CRASHES - 1)), 0) is None
+    assert "exit code 1" in (give_up_reason(attempts(*[1] * MAX_CRASHES), 0) or "")
+    assert "memory" in (give_up_reason(attempts(*[-9] * MAX_CRASHES), 0) or "")
+    assert "worker died" in (give_up_reason(attempts(*[None] * MAX_LOSSES), 0) or "")
 
 
 def test_progress_a_stop_on_request_and_a_retry_start_the_count_anew() -> None:
-    assert hopeless(attempts(*[1] * 9, checkpoint=100), 200) is None
-    assert hopeless(attempts(*[ExitCode.STOPPED] * 99), 0) is None
-    assert hopeless(attempts(*[1] * 9, final=True), 0) is None
+    assert give_up_reason(attempts(*[1] * 9, checkpoint=100), 200) is None
+    assert give_up_reason(attempts(*[ExitCode.STOPPED] * 99), 0) is None
+    assert give_up_reason(attempts(*[1] * 9, final=True), 0) is None

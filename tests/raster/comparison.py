@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.gaussians import Gaussians
 from graings.raster import reference
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.gaussians import Gaussians
 from graings.raster import reference
 from graings.raster.rasterize import rasterize

@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.constants import ALPHA_MAX, ALPHA_MIN, BLUR, NEAR
 from graings.gaussians import Gaussians
 from graings.raster import reference

@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.constants import ALPHA_MIN, BLUR, TILE
 from graings.gaussians import Gaussians
 from graings.raster.photometric import photometric

@@ -49,7 +49,9 @@ def everything(scene: Scene) -> tuple[Tensor, Tensor]:
     return scores.detach(), colors.detach()
 
 
-@pytest.mark.parametrize("config", [{}, {"residual": False}, {"residual_degree": 0}, {"opacity_view": True}], ids=str)
+@pytest.mark.parametrize(
+    "config", [{}, {"residual": False}, {"residual_sh_degree": 0}, {"opacity_view": True}], ids=str
+)
 def test_what_is_drawn_is_what_asking_every_anchor_gives(config: dict[str, Any]) -> None:
     scene = scene_of(**config)
     scores, colors = everything(scene)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from graings.scene.perceptron import Shared, perceptron, plain_perceptron
+from graings.scene.perceptron import GroupBias, perceptron, plain_perceptron
 
 UNIT_ROUNDOFF = 2.0**-24  # float32
 
@@ -129,12 +129,12 @@ def test_any_number_of_threads_gives_the_same_bits(threads: int) -> None:
     assert all(torch.equal(a, b) for a, b in zip(one[1], many[1], strict=True))
 
 
-def in_groups(rows: int, mean: int, width: int) -> Shared:
+def in_groups(rows: int, mean: int, width: int) -> GroupBias:
     """Groups of about `mean` rows, some of none."""
     random = torch.Generator().manual_seed(rows + mean)
     count = max(1, 2 * rows // mean)
     groups = (torch.rand(rows, generator=random) * count).long().sort().values
-    return Shared(torch.randn(count, width, generator=random, dtype=torch.float64), groups)
+    return GroupBias(torch.randn(count, width, generator=random, dtype=torch.float64), groups)
 
 
 @pytest.mark.parametrize("mean", [2, 7, 5000])  # children of an anchor; more than a piece of work holds
@@ -145,7 +145,7 @@ def test_what_rows_share_is_added_to_their_first_layer(rows: int, mean: int, isa
     results = []
     for function in (plain_perceptron, perceptron):
         leaves = [leaf.clone().requires_grad_() for leaf in (*given.leaves(), values)]
-        output = function(leaves[0], leaves[1:4], leaves[4:7], shared=Shared(leaves[7], groups))
+        output = function(leaves[0], leaves[1:4], leaves[4:7], shared=GroupBias(leaves[7], groups))
         results.append([output.detach(), *torch.autograd.grad(output, leaves, v_output)])
     for plain, ours in zip(*results, strict=True):
         assert (ours - plain).norm() <= 1e-12 * plain.norm()
@@ -156,7 +156,7 @@ def test_shared_values_have_the_same_bits_for_any_number_of_threads() -> None:
     results = []
     for threads in (1, 3):
         leaf = values.float().requires_grad_()
-        output = perceptron(given.inputs, given.weights, given.biases, shared=Shared(leaf, groups), threads=threads)
+        output = perceptron(given.inputs, given.weights, given.biases, shared=GroupBias(leaf, groups), threads=threads)
         results.append(torch.autograd.grad(output.sin().sum(), leaf)[0])
     assert torch.equal(*results)
 
@@ -169,14 +169,14 @@ def test_groups_out_of_order_or_range_are_refused() -> None:
                 given.inputs,
                 given.weights,
                 given.biases,
-                shared=Shared(torch.zeros(2, 6).double(), torch.tensor(wrong)),
+                shared=GroupBias(torch.zeros(2, 6).double(), torch.tensor(wrong)),
             )
     with pytest.raises(ValueError, match=r"shared values must be \[group, 6\]"):
         perceptron(
             given.inputs,
             given.weights,
             given.biases,
-            shared=Shared(torch.zeros(2, 5).double(), torch.tensor([0, 0, 1])),
+            shared=GroupBias(torch.zeros(2, 5).double(), torch.tensor([0, 0, 1])),
         )
 
 

@@ -22,13 +22,13 @@ from tests.models import EYE, tiny_scene
 
 
 def test_untrained_deformation_and_residual_are_identity() -> None:
-    awake = tiny_scene(awake=False, temporal=True).compose(EYE, 0.7)
-    static = tiny_scene(awake=False, temporal=False).compose(EYE, 0.7)
-    assert torch.equal(awake.gaussians.means, static.gaussians.means)
-    assert torch.equal(awake.gaussians.log_scales, static.gaussians.log_scales)
-    assert torch.equal(awake.gaussians.colors, static.gaussians.colors)
-    assert torch.equal(awake.gaussians.opacities, static.gaussians.opacities)
-    assert torch.allclose(awake.gaussians.quats, static.gaussians.quats, atol=1e-7)
+    active = tiny_scene(active=False, temporal=True).compose(EYE, 0.7)
+    static = tiny_scene(active=False, temporal=False).compose(EYE, 0.7)
+    assert torch.equal(active.gaussians.means, static.gaussians.means)
+    assert torch.equal(active.gaussians.log_scales, static.gaussians.log_scales)
+    assert torch.equal(active.gaussians.colors, static.gaussians.colors)
+    assert torch.equal(active.gaussians.opacities, static.gaussians.opacities)
+    assert torch.allclose(active.gaussians.quats, static.gaussians.quats, atol=1e-7)
 
 
 def test_gradient_of_canonical_mean_is_bitwise_that_of_the_moved_mean() -> None:
@@ -105,7 +105,7 @@ def test_residual_is_bounded_by_eta() -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_residual_of_colour_sees_the_view_as_configured_and_that_of_opacity_never(degree: int) -> None:
-    scene = tiny_scene(residual_degree=degree)
+    scene = tiny_scene(residual_sh_degree=degree)
     here, there = (scene.compose(eye, 0.4) for eye in (EYE, [-x for x in EYE]))
     assert torch.equal(here.children, there.children)
     assert here.residual is not None
@@ -221,7 +221,7 @@ def test_encoding_of_a_number_that_is_none_is_none(x: float) -> None:
 
 
 def test_networks_begin_alike_whichever_others_there_are() -> None:
-    full, without = tiny_scene(awake=False), tiny_scene(awake=False, residual=False, canonical=False)
+    full, without = tiny_scene(active=False), tiny_scene(active=False, residual=False, canonical=False)
     assert len(without.state_dict()) < len(full.state_dict())
     for name, values in without.state_dict().items():
         assert torch.equal(values, full.state_dict()[name]), name

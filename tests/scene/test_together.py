@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.render import draw
 from graings.scene.scene import Composition, Scene
 from tests.models import tiny_scene
@@ -22,7 +22,7 @@ VIEWS = [(camera.center, time) for camera, time in zip(CAMERAS, TIMES, strict=Tr
 
 FORMS: list[dict[str, Any]] = [
     {},
-    {"deform_time": "input"},
+    {"time_conditioning": "concatenated"},
     {"deformation": "anchor"},
     {"deformation": "none"},
     {"stop_gradient": False},

@@ -7,7 +7,7 @@ import shutil
 import pytest
 from starlette.testclient import TestClient
 
-from graings.run_folder import CHECKPOINTS
+from graings.storage.run_folder import CHECKPOINTS
 from jobs.engine import Engine
 from jobs.job import JobError
 from jobs.store import JobFolder

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from graings.compact import read_compact
+from graings.storage.compact import read_compact
 from jobs.engine import Engine
 from jobs.store import JobFolder
 from service.app import create_app

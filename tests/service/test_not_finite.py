@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from graings.report import write_metrics
+from graings.report.report import write_metrics
 from jobs.progress import ProgressWriter
 from jobs.store import JobFolder
 from service.schemas import ProgressResource

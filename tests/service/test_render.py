@@ -11,11 +11,11 @@ import OpenImageIO as oiio
 import pytest
 from starlette.testclient import TestClient
 
-from graings.camera import Camera
-from graings.checkpoint import load_model
-from graings.encode import encode_image
+from graings.camera.camera import Camera
+from graings.camera.viewpoint import orbit_view
+from graings.image_encoding import encode_image
 from graings.render import render
-from graings.viewpoint import orbit_view
+from graings.storage.checkpoint import load_model
 from jobs.store import JobFolder
 from service.problems import Busy
 from service.scenes import Picture, RenderPool, Scenes

@@ -13,11 +13,11 @@ from torch import Tensor
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import TrainConfig, make_config
-from graings.evaluation import evaluate
+from graings.evaluation.evaluate import evaluate
+from graings.kernel import use_threads
 from graings.raster.photometric import photometric
 from graings.render import draw
 from graings.scene.scene import Scene
-from graings.threads import use_threads
 from graings.training import trainer as trainer_module
 from graings.training.optimizer import Optimizer
 from graings.training.trainer import StepReport, Trainer

@@ -11,8 +11,8 @@ import torch
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import make_config
-from graings.evaluation import evaluate
-from graings.plan import make_plan
+from graings.evaluation.evaluate import evaluate
+from graings.plan.plan import make_plan
 from graings.render import render
 from graings.training import losses
 from tests.capture.captures import entry, orbit, write_image, write_transforms

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from graings.training.average import Average
+from graings.training.parameter_average import ParameterAverage
 from graings.training.trainer import Trainer
 from tests.models import tiny_scene
 from tests.training.micro import micro_trainer, steps
@@ -59,4 +59,4 @@ def test_nothing_is_averaged_while_anchors_may_come_or_go(micro: Path, mark: str
 
 def test_a_mean_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="no step was counted"):
-        Average().apply(tiny_scene())
+        ParameterAverage().apply(tiny_scene())

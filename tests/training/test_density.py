@@ -8,8 +8,9 @@ import torch
 
 from graings.config import DensityConfig, TrainConfig
 from graings.scene.scaffold import Scaffold
-from graings.training.density import DensityStatistics, grow, newborn_offsets, prune, thinned, voxel_keys
-from graings.training.density_control import DensityControl
+from graings.training.density.control import DensityControl
+from graings.training.density.growth import grow, new_anchor_opacity_offsets, prune, thin_out, voxel_keys
+from graings.training.density.statistics import DensityStatistics
 from graings.training.optimizer import Optimizer
 from tests.models import EYE, tiny_scene
 
@@ -112,7 +113,7 @@ def test_thinning_keeps_what_asks_for_more_and_widens_the_rest() -> None:
     statistics.gradient[asking, 1] *= 5  # one child is enough
     statistics.drawn[7] = 0  # never seen
     statistics.gradient[7] = 0
-    keep, wider = thinned(scaffold, statistics, 40, torch.Generator().manual_seed(0))
+    keep, wider = thin_out(scaffold, statistics, 40, torch.Generator().manual_seed(0))
     assert int(keep.sum()) == 40
     assert keep[asking].all()
     assert torch.count_nonzero(wider[asking]) == 0
@@ -120,7 +121,7 @@ def test_thinning_keeps_what_asks_for_more_and_widens_the_rest() -> None:
     assert (int(widened.sum()), bool(keep[widened].all())) == (20, True)
     # A hundred and eighty are replaced by twenty, so that their area is that of all.
     assert torch.allclose(wider[widened].mul(2).exp().sum(), torch.tensor(180.0))
-    again = thinned(scaffold, statistics, 40, torch.Generator().manual_seed(0))
+    again = thin_out(scaffold, statistics, 40, torch.Generator().manual_seed(0))
     assert torch.equal(keep, again[0])
 
 
@@ -128,10 +129,10 @@ def test_newborns_are_faint_or_inherit_when_asked() -> None:
     scaffold = tiny_scene().scaffold
     logits = torch.full((scaffold.count, 3), 1.0)
     parents = torch.tensor([0, 5])
-    faint = newborn_offsets(scaffold, logits, parents, 0.05)
+    faint = new_anchor_opacity_offsets(scaffold, logits, parents, 0.05)
     assert torch.allclose(torch.tanh(logits[parents].amax(-1) + faint), torch.tensor(0.05))
-    assert torch.equal(newborn_offsets(scaffold, logits, parents, None), scaffold.opacity_offsets[parents])
-    fainter = newborn_offsets(scaffold, logits - 3.0, parents, 0.05)
+    assert torch.equal(new_anchor_opacity_offsets(scaffold, logits, parents, None), scaffold.opacity_offsets[parents])
+    fainter = new_anchor_opacity_offsets(scaffold, logits - 3.0, parents, 0.05)
     assert torch.equal(fainter, scaffold.opacity_offsets.detach()[parents])
 
 
@@ -162,7 +163,7 @@ def test_an_anchor_that_showed_much_and_fades_is_pruned_at_the_second_look() -> 
     for faded in (False, True):
         opacities[3] = -0.5 if faded else 0.5
         drawn = (opacities > 0).flatten().nonzero().squeeze(-1)
-        for _ in range(config.density.prune_visits + 1):
+        for _ in range(config.density.prune_min_views + 1):
             control.statistics.observe(
                 drawn, torch.zeros(len(drawn), 2), torch.ones(len(drawn), dtype=torch.bool), opacities, (8, 8)
             )

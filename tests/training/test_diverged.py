@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 import torch
 
-from graings import checkpoint
-from graings.checkpoint import best_checkpoint, load_model, newest_checkpoint
 from graings.errors import CheckpointError, DivergedError
-from graings.evaluation import evaluate
+from graings.evaluation.evaluate import evaluate
 from graings.render import render
-from graings.run_folder import checkpoints
+from graings.storage import checkpoint
+from graings.storage.checkpoint import best_checkpoint, load_model, newest_checkpoint
+from graings.storage.run_folder import checkpoints
 from graings.training.run import TrainingRun
 from tests.training.micro import micro_config, spoil_loss
 

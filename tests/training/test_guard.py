@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from graings.config import GuardConfig
-from graings.training.guard import FEWEST, MAX_RECENT_SKIPS, MEMORY, WINDOW, Gradient, Guard, first_not_finite
-from graings.training.trend import SETTLING, Trend
+from graings.training.guard.guard import FEWEST, MAX_RECENT_SKIPS, MEMORY, WINDOW, Gradient, Guard, first_not_finite
+from graings.training.guard.loss_trend import GROWTH_PAUSE, LossTrend
 
 ONE, NAN = torch.tensor(1.0), torch.tensor(float("nan"))
 
@@ -23,42 +23,42 @@ def _settled() -> Guard:
     """A guard that has seen enough gradients of norm 1."""
     guard = Guard(GuardConfig())
     for iteration in range(WINDOW):
-        assert not guard.judge(iteration, ONE, _gradient(torch.tensor([0.6, 0.8]))).limits
+        assert not guard.check_step(iteration, ONE, _gradient(torch.tensor([0.6, 0.8]))).limits
     return guard
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 def test_one_bad_entry_of_a_gradient_is_named(bad: float) -> None:
     guard, values = Guard(GuardConfig()), torch.ones(100)
-    assert guard.judge(1, ONE, _gradient(values)).culprit is None
+    assert guard.check_step(1, ONE, _gradient(values)).non_finite is None
     values[37] = bad
-    assert guard.judge(2, ONE, _gradient(values)).culprit == "the gradient of p"
-    assert guard.judge(3, torch.tensor(bad), []).culprit == "the loss"
+    assert guard.check_step(2, ONE, _gradient(values)).non_finite == "the gradient of p"
+    assert guard.check_step(3, torch.tensor(bad), []).non_finite == "the loss"
     assert guard.skipped == 2
 
 
 def test_a_gradient_whose_square_overflows_is_large_and_not_wrong() -> None:
-    assert Guard(GuardConfig()).judge(1, ONE, _gradient(torch.full((100,), 1e30))).culprit is None
+    assert Guard(GuardConfig()).check_step(1, ONE, _gradient(torch.full((100,), 1e30))).non_finite is None
 
 
 def test_a_group_far_above_its_median_is_limited_and_the_others_are_not() -> None:
     guard = _settled()
     usual = Gradient("q", "h", torch.ones(1))
-    verdict = guard.judge(WINDOW, ONE, [*_gradient(torch.tensor([300.0, 400.0])), usual])
+    verdict = guard.check_step(WINDOW, ONE, [*_gradient(torch.tensor([300.0, 400.0])), usual])
     assert verdict.limits == {"g": (pytest.approx(500.0), pytest.approx(100.0))}
     assert guard.clipped == 1
-    assert not guard.judge(WINDOW + 1, ONE, _gradient(torch.tensor([60.0, 79.0]))).limits
+    assert not guard.check_step(WINDOW + 1, ONE, _gradient(torch.tensor([60.0, 79.0]))).limits
 
 
 def test_nothing_is_limited_before_the_usual_size_is_known() -> None:
     guard = Guard(GuardConfig())
     for iteration in range(FEWEST):
-        assert not guard.judge(iteration, ONE, _gradient(torch.tensor([10.0**iteration]))).limits
+        assert not guard.check_step(iteration, ONE, _gradient(torch.tensor([10.0**iteration]))).limits
 
 
 def test_a_lasting_change_of_size_becomes_the_usual_size() -> None:
     guard = _settled()
-    limited = [bool(guard.judge(i, ONE, _gradient(torch.tensor([1e3]))).limits) for i in range(2 * WINDOW)]
+    limited = [bool(guard.check_step(i, ONE, _gradient(torch.tensor([1e3]))).limits) for i in range(2 * WINDOW)]
     assert limited[0]
     assert not limited[-1]
 
@@ -66,9 +66,9 @@ def test_a_lasting_change_of_size_becomes_the_usual_size() -> None:
 def test_three_bad_steps_in_a_row_are_a_problem_and_a_good_one_forgives() -> None:
     guard = Guard(GuardConfig())
     for iteration, loss in enumerate((NAN, NAN, ONE, NAN, NAN)):
-        guard.judge(iteration, loss, [])
+        guard.check_step(iteration, loss, [])
         assert guard.problem() is None
-    guard.judge(5, NAN, [])
+    guard.check_step(5, NAN, [])
     assert guard.problem() == "the loss was not finite in 3 steps in a row"
 
 
@@ -77,26 +77,26 @@ def test_ten_bad_steps_among_a_thousand_are_a_problem_and_old_ones_are_forgotten
     for number in range(MAX_RECENT_SKIPS):
         for guard, apart in ((often, 50), (rarely, MEMORY // MAX_RECENT_SKIPS + 12)):
             assert guard.problem() is None
-            guard.judge(number * apart, NAN, [])
-            guard.judge(number * apart + 1, ONE, [])
+            guard.check_step(number * apart, NAN, [])
+            guard.check_step(number * apart + 1, ONE, [])
     assert "10 of the last 1000 steps" in str(often.problem())
     assert rarely.problem() is None
 
 
 def test_a_guard_continues_from_its_state_with_the_same_verdicts() -> None:
     one = _settled()
-    one.judge(WINDOW, NAN, [])
+    one.check_step(WINDOW, NAN, [])
     other = Guard(GuardConfig())
     other.load(*one.state())
     assert other.state()[1] == one.state()[1]
     large = _gradient(torch.tensor([1e4]))
-    assert other.judge(WINDOW + 1, ONE, large) == one.judge(WINDOW + 1, ONE, large)
+    assert other.check_step(WINDOW + 1, ONE, large) == one.check_step(WINDOW + 1, ONE, large)
 
 
 def test_after_going_back_counts_stay_and_the_reasons_to_go_back_are_gone() -> None:
     before = Guard(GuardConfig())
     for iteration in range(3):
-        before.judge(iteration, NAN, [])
+        before.check_step(iteration, NAN, [])
     after = Guard(GuardConfig())
     after.rolled_back(before)
     assert (after.skipped, after.problem()) == (3, None)
@@ -109,14 +109,14 @@ def test_the_first_tensor_that_is_not_finite_is_named() -> None:
     assert first_not_finite({}) is None
 
 
-def _losses(trend: Trend, *losses: tuple[float, int]) -> None:
+def _losses(trend: LossTrend, *losses: tuple[float, int]) -> None:
     for loss, times in losses:
         for _ in range(times):
             trend.add(loss)
 
 
 def test_a_loss_that_stays_far_above_its_best_is_divergence() -> None:
-    trend = Trend(GuardConfig(patience=200))
+    trend = LossTrend(GuardConfig(patience=200))
     _losses(trend, (0.1, 300), (0.5, 150))
     assert trend.problem() is None
     assert not trend.healthy
@@ -126,36 +126,36 @@ def test_a_loss_that_stays_far_above_its_best_is_divergence() -> None:
 
 @pytest.mark.parametrize(("best", "later"), [(0.001, 0.015), (0.1, 0.19)])
 def test_a_loss_that_doubles_unseen_or_not_quite_is_no_divergence(best: float, later: float) -> None:
-    trend = Trend(GuardConfig(patience=10))
+    trend = LossTrend(GuardConfig(patience=10))
     _losses(trend, (best, 300), (later, 1000))
     assert trend.problem() is None
     assert trend.healthy
 
 
 def test_a_single_outlier_is_no_divergence() -> None:
-    trend = Trend(GuardConfig(patience=100))
+    trend = LossTrend(GuardConfig(patience=100))
     _losses(trend, (0.1, 300), (5.0, 1), (0.1, 300))
     assert trend.problem() is None
 
 
 def test_an_easy_view_at_the_start_is_not_the_best_that_a_run_has_been() -> None:
-    trend = Trend(GuardConfig(patience=10))
+    trend = LossTrend(GuardConfig(patience=10))
     _losses(trend, (0.01, 1), (0.3, 300))
     assert trend.problem() is None
 
 
 def test_steps_right_after_a_growth_do_not_count_as_divergence() -> None:
-    trend = Trend(GuardConfig(patience=10))
+    trend = LossTrend(GuardConfig(patience=10))
     _losses(trend, (0.1, 300))
     trend.grown()
-    _losses(trend, (5.0, SETTLING))
+    _losses(trend, (5.0, GROWTH_PAUSE))
     assert trend.problem() is None
     _losses(trend, (5.0, 10))
     assert trend.problem() is not None
 
 
 def test_a_trend_continues_from_its_state() -> None:
-    one, other = Trend(GuardConfig()), Trend(GuardConfig())
+    one, other = LossTrend(GuardConfig()), LossTrend(GuardConfig())
     _losses(one, (0.1, 50), (0.7, 20))
     other.load(one.state())
     assert other.state() == one.state()

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from graings.config import LossConfig
+from graings.random import RandomStreams
 from graings.scene.deformation import deformation_from
 from graings.training import losses, regularisers
-from graings.training.streams import Streams
 from tests.models import EYE, tiny_scene
 
 RAW = torch.randn(7, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -61,9 +61,9 @@ def test_the_temporal_term_takes_every_child_of_a_small_scene_and_a_share_of_a_l
 
         scene.deform = counted  # type: ignore[method-assign, assignment]
         one = scene.compose(EYE, 0.5)
-        config = LossConfig(l_def=False, l_res=False, l_rigid=False, temporal_share=0.5)
+        config = LossConfig(deformation=0.0, residual=0.0, rigidity=0.0, temporal_share=0.5)
         term = regularisers.regularisers(
-            scene, [one], [0.5], torch.linspace(0, 1, 5).double().numpy(), config, Streams(0)
+            scene, [one], [0.5], torch.linspace(0, 1, 5).double().numpy(), config, RandomStreams(0)
         )
         assert float(term.detach()) > 0
         looked_at.append(len(one.children))

@@ -94,7 +94,7 @@ def test_matrices_of_geometry_are_its_own_and_all_else_is_adams() -> None:
 
 
 def test_adam_takes_everything_where_it_is_asked_to() -> None:
-    assert Optimizer(tiny_scene(), TrainConfig(matrix_step="adam"), joint_from=0).muon.parameters == []
+    assert Optimizer(tiny_scene(), TrainConfig(matrix_optimizer="adam"), joint_from=0).muon.parameters == []
 
 
 def test_momenta_come_back_by_name_and_those_of_adam_are_left() -> None:

@@ -11,21 +11,21 @@ import torch
 from torch import Tensor
 
 from graings.config import LossConfig
+from graings.random import RandomStreams
 from graings.scene.deformation import Deformation
 from graings.scene.scene import Composition, Scene
 from graings.training import losses
 from graings.training.regularisers import regularisers
-from graings.training.streams import Streams
 from tests.models import EYE, tiny_scene
 
 TIMES = np.array([0.0, 0.3, 0.6, 1.0])
-ONLY_RIGIDITY = {"l_temp": False, "l_def": False, "l_res": False, "rigidity": 1.0}
+ONLY_RIGIDITY = {"temporal": 0.0, "deformation": 0.0, "residual": 0.0, "rigidity": 1.0}
 
 
 def strain(scene: Scene, compositions: list[Composition], **config: object) -> Tensor:
     """The term of these compositions alone."""
     loss = LossConfig.model_validate(ONLY_RIGIDITY | config)
-    return regularisers(scene, compositions, list(TIMES), TIMES, loss, Streams(0))
+    return regularisers(scene, compositions, list(TIMES), TIMES, loss, RandomStreams(0))
 
 
 def placed(compositions: list[Composition], places: list[Tensor]) -> list[Composition]:
@@ -110,7 +110,7 @@ def test_the_gradient_is_that_of_the_formula() -> None:
 def test_a_step_of_one_view_a_still_scene_and_coincident_children_have_no_strain() -> None:
     scene = tiny_scene(anchors=60)
     assert float(strain(scene, together(scene)[:1])) == 0
-    assert float(strain(scene, together(scene), l_rigid=False)) == 0
+    assert float(strain(scene, together(scene), rigidity=0.0)) == 0
     assert float(strain(tiny_scene(temporal=False), together(tiny_scene(temporal=False)))) == 0
     compositions = together(scene)
     here = torch.zeros_like(compositions[0].canonical_means)

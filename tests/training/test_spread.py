@@ -10,7 +10,7 @@ import torch
 
 from graings.capture.synthetic import write_synthetic
 from graings.config import SceneConfig
-from graings.evaluation import evaluate
+from graings.evaluation.evaluate import evaluate
 from tests.training.micro import GROWING, micro_trainer, plain_training, quality, steps
 
 pytestmark = pytest.mark.slow

@@ -12,14 +12,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from graings.camera import Camera
+from graings.camera.camera import Camera
 from graings.capture.capture import Frame
 from graings.constants import BLUR
 from graings.gaussians import Gaussians
 from graings.raster.rasterize import rasterize
 from graings.raster.reference import _rotations
+from graings.training.guard.stiffness import STIFF, Stiffness, footprints, step_over_size, subpixel_share
 from graings.training.run import TrainingRun
-from graings.training.stiffness import STIFF, Stiffness, footprints, step_over_size, subpixel_share
 from tests.capture.captures import orbit
 from tests.models import tiny_scene
 from tests.scenes import gaussians, pinhole, rows
@@ -28,7 +28,7 @@ from tests.training.micro import finite, micro_config, micro_trainer, said, step
 WHITE = (1.0, 1.0, 1.0)
 
 
-def _moved(batch: Gaussians, share: Tensor) -> Gaussians:
+def _predicted_deformation(batch: Gaussians, share: Tensor) -> Gaussians:
     """Each Gaussian goes `share` of its own size, in a direction of its own, by the oracle's rotations."""
     direction = torch.randn(len(batch), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     local = direction / direction.norm(dim=1, keepdim=True) * batch.log_scales.exp() * share.unsqueeze(1)
@@ -38,7 +38,7 @@ def _moved(batch: Gaussians, share: Tensor) -> Gaussians:
 def test_a_step_is_measured_in_sizes_of_what_is_there_both_times() -> None:
     sharp = pinhole(focal=1e12)  # sees everything: no pixel widens a Gaussian
     before = gaussians(1_000, seed=0)
-    after = _moved(before, torch.linspace(0, 1, 1_000, dtype=torch.float64))
+    after = _predicted_deformation(before, torch.linspace(0, 1, 1_000, dtype=torch.float64))
     assert step_over_size(before, after, sharp, BLUR) == pytest.approx(0.99, abs=1e-6)
     # Others come and go, and rows change places: each is still compared with itself.
     order = torch.randperm(900, generator=torch.Generator().manual_seed(1)) + 100

@@ -17,12 +17,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from graings.checkpoint import load_model
 from graings.errors import DivergedError
 from graings.raster.rasterize import rasterize
 from graings.render import draw, render
-from graings.training.budget import affordable_anchors, bytes_per_anchor
-from graings.training.density import MIN_ANCHORS
+from graings.storage.checkpoint import load_model
+from graings.training.density.budget import affordable_anchors, bytes_per_anchor
+from graings.training.density.growth import MIN_ANCHORS
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 from tests.scenes import overlapping
@@ -260,7 +260,7 @@ def test_growth_without_end_stops_at_the_budget(micro: Path, batch: int) -> None
             "density.min_observations": 0,
             "density.statistics_from": 0,
             "density.memory_mb": memory_mb,
-            "density.prune_visits": 10_000,  # nothing makes room
+            "density.prune_min_views": 10_000,  # nothing makes room
         },
     )
     most = affordable_anchors(trainer.config.scene, batch, memory_mb)
@@ -277,7 +277,7 @@ def test_growth_without_end_stops_at_the_budget(micro: Path, batch: int) -> None
 
 def test_anchors_that_show_nothing_make_room_for_growth(micro: Path) -> None:
     growing = {"density.statistics_from": 0, "density.grow_from": 0, "density.grow_until": 30_000}
-    eager = {"density.grow_every": 10, "density.gradient_threshold": 1e-9, "density.prune_visits": 15}
+    eager = {"density.grow_every": 10, "density.gradient_threshold": 1e-9, "density.prune_min_views": 15}
     trainer = micro_trainer(micro, **growing, **eager, **{"density.max_anchors": 60})
     scaffold = trainer.scene.scaffold
     count, showing = scaffold.count, 40
@@ -294,7 +294,7 @@ def test_anchors_that_show_nothing_make_room_for_growth(micro: Path) -> None:
 
 def test_more_than_the_budget_from_the_first_step_on_is_thinned(micro: Path) -> None:
     growing = {"density.statistics_from": 0, "density.grow_from": 0, "density.grow_until": 30_000}
-    eager = {"density.grow_every": 10, "density.prune_visits": 15}
+    eager = {"density.grow_every": 10, "density.prune_min_views": 15}
     found = {}
     for most in (40, 20_000):
         trainer = micro_trainer(micro, iterations=400, **growing, **eager, **{"density.max_anchors": most})
@@ -325,7 +325,7 @@ def test_pruning_everything_leaves_a_scene_to_train(micro: Path) -> None:
             "density.prune_until": 30_000,
             "density.prune_every": 300,
             "density.prune_opacity": 1e9,
-            "density.prune_visits": 1,
+            "density.prune_min_views": 1,
             "density.statistics_from": 0,
         },
     )
@@ -497,7 +497,7 @@ def test_children_born_in_one_place_part(micro: Path) -> None:
 @pytest.mark.parametrize("newborn", [None, 0.02])
 def test_growing_does_not_tear_the_picture(micro: Path, monkeypatch: pytest.MonkeyPatch, newborn: float | None) -> None:
     """E19: quality right before and right after each growth; newborns as opaque as their parent, and faint ones."""
-    trainer = micro_trainer(micro, **GROWING, **{"density.newborn_opacity": newborn})
+    trainer = micro_trainer(micro, **GROWING, **{"density.new_anchor_opacity": newborn})
     drops: list[float] = []
     grow = trainer.density.grow
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from graings.config import make_config
-from graings.training.time_window import TimeWindow
+from graings.training.curriculum.time_window import TimeWindow
 from tests.training.micro import micro_trainer, steps
 
 TIMES = [index / 20 for index in range(21)]

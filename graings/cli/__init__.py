@@ -1,0 +1,3 @@
+"""The command line."""
+
+from graings.cli.main import main as main

@@ -1,0 +1,74 @@
+"""A configuration from a preset and single options, from a stored document, and the JSON schema of all options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from pydantic import ValidationError
+
+from graings.config.presets import PRESETS
+from graings.config.sections import ConfigSection
+from graings.config.train_config import TrainConfig
+from graings.errors import CheckpointError, ConfigError
+
+MAX_DEPTH: Final = 8  # more levels than any option has
+
+Stored = TypeVar("Stored", bound=ConfigSection)
+
+
+def make_config(preset: str = "standard", overrides: dict[str, Any] | None = None) -> TrainConfig:
+    """A preset with overrides, which are nested like the config or flat with dotted keys (`"loss.ssim": 0.1`).
+
+    Raises `ConfigError` naming the field for anything unknown or out of range.
+    """
+    overrides = dict(overrides or {})
+    preset = str(overrides.pop("preset", preset))
+    if preset not in PRESETS:
+        raise ConfigError(f"preset: unknown preset {preset!r}. Choose one of {', '.join(PRESETS)}.")
+    values: dict[str, Any] = {"preset": preset}
+    _merge(values, overrides)
+    try:
+        return TrainConfig.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{_problems(error)}. `graings options` lists every field with its bounds.") from error
+
+
+def restored(kind: type[Stored], values: Any, source: Path) -> Stored:
+    """Options as a file of ours holds them. Raises `CheckpointError` naming the file and the fields it got wrong."""
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise CheckpointError(
+            f"{source}: its options are not those of this version ({_problems(error)}). "
+            "Use the version that wrote it, or train again."
+        ) from error
+
+
+def _problems(error: ValidationError) -> str:
+    return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+
+
+def _merge(into: dict[str, Any], values: dict[str, Any], depth: int = 0) -> None:
+    for key, value in values.items():
+        head, _, rest = key.partition(".")
+        if depth > MAX_DEPTH:
+            raise ConfigError(f"{head[:40]}: no option has so many parts. `graings options` lists every field.")
+        if rest:
+            value = {rest: value}
+        if isinstance(value, dict):
+            child = into.setdefault(head, {})
+            if not isinstance(child, dict):
+                part = "no parts" if not value else f"no part {next(iter(value))!r}"
+                raise ConfigError(f"{head}: is a value, it has {part}. `graings options` lists every field.")
+            _merge(child, value, depth + 1)
+        else:
+            into[head] = value
+
+
+def options() -> dict[str, Any]:
+    """JSON schema of every option with default, bounds and help, and the presets."""
+    return {
+        "schema": TrainConfig.model_json_schema(),
+        "presets": {name: make_config(name).model_dump(mode="json") for name in PRESETS},
+    }

@@ -1,0 +1,55 @@
+"""Evaluation: how close rendered views come to held-out images.
+
+Knows nothing of training.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+
+from numpy.typing import ArrayLike
+
+from graings.capture.capture import Frame
+from graings.capture.images import ImageStore
+from graings.evaluation.metrics import Lpips, SplitMetrics, measure_split
+from graings.render import render
+from graings.scene.scene import Scene
+
+
+def evaluate(
+    scene: Scene,
+    frames: Sequence[Frame],
+    images: ImageStore,
+    background: Sequence[float],
+    *,
+    lpips: Lpips | None = None,
+) -> SplitMetrics:
+    """Metrics of `scene` on `frames`: each view rendered at its own camera and time."""
+
+    def pairs() -> Iterator[tuple[str, float, ArrayLike, ArrayLike]]:
+        for frame in frames:
+            rendered = render(scene, frame.camera, frame.time, background)
+            yield frame.name, frame.time, rendered.color.clamp(0, 1).numpy(), images.rgb(frame)
+
+    return measure_split(pairs(), lpips)
+
+
+def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:
+    """At most `size` frames chosen by the hash of their names: fixed for a capture, spread over it."""
+    if len(frames) <= size:
+        return tuple(frames)
+    order = sorted(range(len(frames)), key=lambda i: hashlib.sha256(frames[i].name.encode()).digest())
+    return tuple(frames[i] for i in sorted(order[:size]))
+
+
+def frames_per_second(scene: Scene, frames: Sequence[Frame], background: Sequence[float]) -> float:
+    """Median speed of rendering `frames` at their size after one to warm up, networks included."""
+    seconds = []
+    for frame in (frames[0], *frames):
+        started = time.perf_counter()
+        render(scene, frame.camera, frame.time, background)
+        seconds.append(time.perf_counter() - started)
+    return 1.0 / max(statistics.median(seconds[1:]), 1e-9)

@@ -1,0 +1,123 @@
+"""Compact: a model as one small file that is enough to render it.
+
+Features and opacities are rounded to half precision where that can hold them, anchors that no time and no camera can
+show are left out, birth numbers become ranks, and the whole is compressed. Networks and whatever places a Gaussian stay
+as they are: two that nearly touch would change places in depth, and a pixel its colour by a tenth. Knows nothing of
+training.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import os
+import zlib
+from pathlib import Path
+from typing import Final
+
+import torch
+from jaxtyping import Bool, Float
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from graings import constants
+from graings.errors import CheckpointError
+from graings.scene.scaffold import Scaffold
+from graings.scene.scene import Scene
+from graings.storage.checkpoint import load_model
+from graings.storage.model import Model, model_facts, model_from
+from graings.storage.run_folder import newest_model
+
+FORMAT: Final = "graings.model/1"
+SUFFIX: Final = ".graings"
+
+_FACTS: Final = "graings"
+
+# Rows of the scaffold that half precision is enough for.
+_HALVED: Final = ("features", "opacity_offsets")
+
+
+def write_compact(model: Model, path: Path) -> int:
+    """Write `model` to the file `path`, whole or not at all; returns its size in bytes.
+
+    Raises `CheckpointError` where the file cannot be written.
+    """
+    tensors = {name: tensor.detach() for name, tensor in model.scene.state_dict().items()}
+    for name in _HALVED:
+        halved = tensors[f"scaffold.{name}"].half()
+        if bool(halved.isfinite().all()):  # half precision ends at 65 504; what is larger must not become infinite
+            tensors[f"scaffold.{name}"] = halved
+    order = tensors["scaffold.uids"].argsort()
+    # Asked of what is written, so that a file read and written again is the same file.
+    seen = can_be_seen(model.scene, *(tensors[f"scaffold.{name}"].float() for name in _HALVED))
+    order = order[seen[order]]
+    for name in Scaffold.ROWS:
+        tensors[f"scaffold.{name}"] = tensors[f"scaffold.{name}"][order]
+    # Ties between Gaussians are broken by the order of birth, which their order in the file keeps.
+    del tensors["scaffold.uids"]
+    facts = model_facts(
+        scene=model.scene,
+        units=model.units,
+        background=model.background,
+        views=model.views,
+        config=model.config,
+        iteration=model.iteration,
+        finished=model.finished,
+    )
+    plain = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    # One entry, because the library orders several by chance.
+    data = save(plain, {_FACTS: json.dumps({"format": FORMAT, **facts}, allow_nan=False)})
+    packed = gzip.compress(data, mtime=0)
+    if not path.name or path.is_dir():
+        raise CheckpointError(f"{path}: is a folder where a file is wanted. Name a file in it.")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")  # two may write at once; the last one stays
+    try:
+        part.write_bytes(packed)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise CheckpointError(f"{path}: cannot write the model ({error.strerror}). Name another place.") from error
+    return len(packed)
+
+
+def read_compact(path: Path) -> Model:
+    """The model in the file `path`, in float32. Raises `CheckpointError`."""
+    try:
+        packed = path.read_bytes()
+        data = gzip.decompress(packed)
+        size = int.from_bytes(data[:8], "little")
+        facts = json.loads(json.loads(data[8 : 8 + size])["__metadata__"][_FACTS])
+        if facts["format"] != FORMAT:
+            raise CheckpointError(f"{path}: not in the format {FORMAT}. It was written by another version.")
+        tensors = load(data)
+        tensors = {name: tensor.float() for name, tensor in tensors.items()}
+        tensors["scaffold.uids"] = torch.arange(len(tensors["scaffold.anchors"]))
+        return model_from(facts, tensors, hashlib.sha256(packed).hexdigest(), path)
+    except (OSError, EOFError, zlib.error, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"{path}: no model, or a damaged one ({error}). Export it again.") from error
+
+
+def open_model(path: Path) -> Model:
+    """The model in a file of `write_compact`, or in a run or checkpoint folder. Raises `CheckpointError`.
+
+    A run whose checkpoints were removed to save space has its compact file still.
+    """
+    found = path if path.is_file() else newest_model(path)
+    return read_compact(found) if found is not None and found.is_file() else load_model(path)
+
+
+def can_be_seen(
+    scene: Scene, features: Float[Tensor, "anchor feature"], opacity_offsets: Float[Tensor, " anchor"]
+) -> Bool[Tensor, " anchor"]:
+    """Which anchors with these rows have a child that may be drawn at some time from somewhere.
+
+    The others never change a pixel.
+    """
+    with torch.no_grad():
+        logits = scene.appearance.highest_opacity_logits(features)
+        highest = torch.tanh(logits + opacity_offsets.unsqueeze(-1)).amax(-1)
+    # The residual is bounded; a hundredth of its bound covers what rounding does to a score.
+    reach = 1.01 * scene.residual.scale if scene.residual is not None else 0.0
+    return highest > constants.ALPHA_MIN - reach

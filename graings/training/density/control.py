@@ -1,0 +1,114 @@
+"""DensityControl: when anchors are watched, grown and pruned over a run, and what that needs to remember.
+
+`density` decides which; this asks it when the schedule says so and has scene, optimizer and statistics follow. Knows
+nothing of images, losses or guards.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from graings.config import TrainConfig
+from graings.scene.scene import Scene
+from graings.training.density import growth
+from graings.training.density.budget import most_anchors
+from graings.training.density.statistics import DensityStatistics
+from graings.training.guard.collapse import mean_logits
+from graings.training.optimizer import Optimizer
+
+# With more of the anchors' budget taken than this, growth first removes those that show nothing.
+NEAR_BUDGET = 0.9
+
+# Where more anchors stand than may, and nine tenths of them have been seen often enough for what shows nothing to have
+# gone, those that are left are thinned to this share of the budget. Nothing could be born for the rest of the run.
+MIN_OBSERVED_FRACTION = 0.9
+THINNED_FRACTION = 0.5
+
+
+class DensityControl:
+    """Grows and prunes one scene. `voxel_size` is that of the finest cells, normalised."""
+
+    def __init__(self, config: TrainConfig, scene: Scene, voxel_size: float) -> None:
+        self.config = config.density.model_copy(update={"max_anchors": most_anchors(config)})
+        self.scaled = config.scaled
+        self.voxel_size = voxel_size
+        self.next_uid = scene.scaffold.count
+        self.statistics = DensityStatistics(scene.scaffold.count, scene.scaffold.slots)
+
+    def watches(self, iteration: int) -> bool:
+        """Whether what `iteration` draws counts for the next growth or pruning."""
+        last_growth = self.scaled(self.config.grow_until)
+        growing = self.scaled(self.config.statistics_from) < iteration <= last_growth
+        return growing or last_growth < iteration <= self.scaled(self.config.prune_until)
+
+    def grows(self, iteration: int) -> bool:
+        """Whether anchors may be added after `iteration`."""
+        first, last = self.scaled(self.config.grow_from), self.scaled(self.config.grow_until)
+        return first <= iteration <= last and iteration % self.config.grow_every == 0
+
+    def prunes(self, iteration: int) -> bool:
+        """Whether anchors that show nothing go after `iteration`."""
+        first, last = self.scaled(self.config.prune_from), self.scaled(self.config.prune_until)
+        return first <= iteration <= last and iteration % max(1, self.scaled(self.config.prune_every)) == 0
+
+    def grow(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> tuple[int, list[str]]:
+        """Add anchors where the pictures ask for them; returns how many, and what happened in words."""
+        events: list[str] = []
+        # Anchors that show nothing would keep others from growing for good: what is not drawn does not come back.
+        if scene.scaffold.count > NEAR_BUDGET * self.config.max_anchors:
+            judged = float((self.statistics.visits > self.config.prune_min_views).double().mean())
+            events = self.prune(scene, optimizer)
+            if judged > MIN_OBSERVED_FRACTION and scene.scaffold.count > self.config.max_anchors:
+                events += self._thin(scene, optimizer, generator)
+        grown = growth.grow(
+            scene.scaffold,
+            self.statistics,
+            mean_logits(scene),
+            self.config,
+            self.voxel_size,
+            self.next_uid,
+            generator,
+        )
+        self.statistics.forget_grown(self.config.min_observations)
+        if grown.capped:
+            events.append("growth_capped: the budget of anchors is used up or too many wanted to grow")
+        if len(grown) > 0:
+            optimizer.append(grown.rows)
+            self.statistics.resize(append=len(grown))
+            self.next_uid += len(grown)
+            events.insert(0, f"grew {len(grown)} anchors")
+        return len(grown), events
+
+    def prune(self, scene: Scene, optimizer: Optimizer) -> list[str]:
+        """Remove anchors that show nothing; returns what happened, in words."""
+        keep = growth.prune(scene.scaffold, self.statistics, self.config)
+        self.statistics.forget_judged(self.config.prune_min_views)
+        removed = int((~keep).sum())
+        if removed == 0:
+            return []
+        optimizer.keep(keep)
+        self.statistics.resize(keep=keep)
+        return [f"pruned {removed} anchors"]
+
+    def _thin(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> list[str]:
+        """Make room where what stood from the first is more than may be; returns what happened, in words."""
+        count, most = scene.scaffold.count, max(2, int(THINNED_FRACTION * self.config.max_anchors))
+        keep, wider = growth.thin_out(scene.scaffold, self.statistics, most, generator)
+        with torch.no_grad():
+            scene.scaffold.log_scales.add_(wider.unsqueeze(-1))
+        optimizer.keep(keep)
+        self.statistics.resize(keep=keep)
+        return [f"thinned {count} anchors to {most}: more stood from the first than the budget holds"]
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Statistics, and facts as JSON."""
+        return self.statistics.state(), {"next_uid": self.next_uid, "voxel_size": self.voxel_size}
+
+    def load(self, statistics: dict[str, Tensor], facts: dict[str, Any]) -> None:
+        """Continue from what `state()` gave."""
+        self.statistics.load(statistics)
+        self.next_uid = int(facts["next_uid"])
+        self.voxel_size = float(facts["voxel_size"])

@@ -1,0 +1,78 @@
+"""DensityStatistics: what training observes of each child and anchor, on which growth and pruning decide."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from graings import constants
+
+
+class DensityStatistics:
+    """What was observed of each child, and of each anchor, since it was judged last; float64 sums and int64 counts.
+
+    `gradient` and `drawn` [A, k]: sum of NDC gradient norms and times drawn, per child. `opacity` and `visits`
+    [A]: sum over visits of the summed positive child scores, and times the anchor was in view or too faint to be drawn.
+    """
+
+    NAMES = ("gradient", "drawn", "opacity", "visits")
+
+    def __init__(self, anchors: int, children: int) -> None:
+        self.gradient = torch.zeros(anchors, children, dtype=torch.float64)
+        self.drawn = torch.zeros(anchors, children, dtype=torch.int64)
+        self.opacity = torch.zeros(anchors, dtype=torch.float64)
+        self.visits = torch.zeros(anchors, dtype=torch.int64)
+
+    def observe(
+        self,
+        children: Int64[Tensor, " gaussian"],
+        screen_gradient: Float[Tensor, "gaussian 2"],
+        visible: Bool[Tensor, " gaussian"],
+        opacities: Float[Tensor, "anchor child"],
+        size: tuple[int, int],
+    ) -> None:
+        """Record one view of a step.
+
+        `children` are flat slots, `screen_gradient` is dL/d(mean in pixels), `visible` says which Gaussians
+        touched the image of `size` (width, height), `opacities` are the scores of every slot.
+        """
+        half = torch.tensor([size[0] / 2.0, size[1] / 2.0], dtype=torch.float64)
+        norms = (screen_gradient.double() * half).norm(dim=-1)
+        seen = children[visible]
+        self.gradient.view(-1).index_add_(0, seen, norms[visible])
+        self.drawn.view(-1).index_add_(0, seen, torch.ones_like(seen))
+        # An anchor without a drawn child is seen too: its opacity is what pruning wants to know.
+        visited = opacities.amax(dim=-1) <= constants.ALPHA_MIN
+        visited[seen // opacities.shape[1]] = True
+        self.visits += visited
+        self.opacity += opacities.clamp_min(0).sum(-1).double() * visited
+
+    def resize(self, keep: Bool[Tensor, " anchor"] | None = None, append: int = 0) -> None:
+        """Follow the scaffold: drop rows outside `keep`, then add `append` empty ones."""
+        for name in self.NAMES:
+            rows: Tensor = getattr(self, name)
+            if keep is not None:
+                rows = rows[keep]
+            setattr(self, name, torch.cat([rows, rows.new_zeros((append, *rows.shape[1:]))]))
+
+    def forget_grown(self, min_observations: int) -> None:
+        """Start anew for children that were observed often enough to be judged."""
+        judged = self.drawn > min_observations
+        self.gradient[judged] = 0
+        self.drawn[judged] = 0
+
+    def forget_judged(self, visits: int) -> None:
+        """Start anew for anchors seen more than `visits` times: what one showed long ago does not say what it shows."""
+        judged = self.visits > visits
+        self.opacity[judged] = 0
+        self.visits[judged] = 0
+
+    def state(self) -> dict[str, Tensor]:
+        """Sums and counts by name."""
+        return {name: getattr(self, name) for name in self.NAMES}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Continue from what `state()` gave."""
+        for name in self.NAMES:
+            setattr(self, name, state[name].clone())

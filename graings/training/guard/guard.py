@@ -1,0 +1,160 @@
+"""Guard: whether a step may reach the optimiser, and whether training has gone wrong.
+
+Bad gradients must be stopped before the optimiser: one spike of 1e3 times the usual size freezes its parameter
+for 20 000 steps of Adam. A bad step is skipped and recorded, an oversized one limited and recorded; nothing is ever
+repaired. The guard measures and counts, the trainer acts. Knows nothing of scenes, views or schedules.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+import torch
+from torch import Tensor
+
+from graings.config import GuardConfig
+from graings.training.guard.loss_trend import LossTrend
+
+# One bad step can be a freak of a single view; three in a row mean the parameters themselves are lost.
+MAX_CONSECUTIVE_SKIPS: Final = 3
+
+# So do this many among the last MEMORY steps.
+MAX_RECENT_SKIPS: Final = 10
+MEMORY: Final = 1_000
+
+# The usual size of a group's gradient is the median over this many steps; with fewer than FEWEST there is none yet.
+WINDOW: Final = 200
+FEWEST: Final = 20
+
+
+class Gradient(NamedTuple):
+    """One gradient tensor; those of one `group` are limited together."""
+
+    name: str
+    group: str
+    values: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class StepCheck:
+    """On one step: the name of what is not finite in it, if anything, and groups that are far too large.
+
+    `limits` maps a group to (its norm, the norm it may have).
+    """
+
+    non_finite: str | None = None
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+class Guard:
+    """Judges steps and remembers what it takes to judge the next ones.
+
+    `skipped`, `clipped` and `rollbacks` count what has happened in the whole run, also what a rollback undid.
+    """
+
+    def __init__(self, config: GuardConfig) -> None:
+        self.config = config
+        self.skipped = 0
+        self.clipped = 0
+        self.rollbacks = 0
+        self.consecutive = 0
+        self.trend = LossTrend(config)
+        self._recent: list[int] = []
+        self._norms: dict[str, deque[float]] = {}
+        self._last = ""
+
+    def check_step(self, iteration: int, loss: Tensor, gradients: Sequence[Gradient]) -> StepCheck:
+        """Judge the step `iteration`, whose mean loss and gradients are given, before the optimiser sees it."""
+        norms = _norms(gradients)
+        non_finite = None if bool(torch.isfinite(loss)) else "the loss"
+        if non_finite is None:
+            bad = (gradient.name for gradient, norm in zip(gradients, norms, strict=True) if not math.isfinite(norm))
+            non_finite = next((f"the gradient of {name}" for name in bad), None)
+        if non_finite is not None:
+            self.skipped += 1
+            self.consecutive += 1
+            self._recent = [*(one for one in self._recent if one > iteration - MEMORY), iteration]
+            self._last = non_finite
+            return StepCheck(non_finite)
+        self.consecutive = 0
+        self.trend.add(float(loss))
+        limits = self._limits(gradients, norms)
+        self.clipped += bool(limits)
+        return StepCheck(None, limits)
+
+    def problem(self) -> str | None:
+        """Why training cannot go on from here, or None."""
+        if self.consecutive >= MAX_CONSECUTIVE_SKIPS:
+            return f"{self._last} was not finite in {self.consecutive} steps in a row"
+        if len(self._recent) >= MAX_RECENT_SKIPS:
+            return f"{len(self._recent)} of the last {MEMORY} steps were not finite, the last because of {self._last}"
+        return self.trend.problem()
+
+    def rolled_back(self, before: Guard) -> None:
+        """This guard belongs to a restored moment; take over the counts of the guard that went wrong since."""
+        self.skipped, self.clipped, self.rollbacks = before.skipped, before.clipped, before.rollbacks
+        self.consecutive, self._recent = 0, []
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything the next verdict depends on: norms by group, and plain numbers."""
+        tensors = {name: torch.tensor(list(norms), dtype=torch.float64) for name, norms in self._norms.items()}
+        return tensors, {
+            "skipped": self.skipped,
+            "clipped": self.clipped,
+            "rollbacks": self.rollbacks,
+            "consecutive": self.consecutive,
+            "recent": list(self._recent),
+            "last": self._last,
+            "trend": self.trend.state(),
+        }
+
+    def load(self, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
+        """Continue from what `state()` gave."""
+        self._norms = {name: deque(norms.tolist(), maxlen=WINDOW) for name, norms in tensors.items()}
+        self.skipped, self.clipped, self.rollbacks = facts["skipped"], facts["clipped"], facts["rollbacks"]
+        self.consecutive, self._recent, self._last = facts["consecutive"], list(facts["recent"]), facts["last"]
+        self.trend.load(facts["trend"])
+
+    def _limits(self, gradients: Sequence[Gradient], norms: Sequence[float]) -> dict[str, tuple[float, float]]:
+        squares: dict[str, list[float]] = {}
+        for gradient, norm in zip(gradients, norms, strict=True):
+            squares.setdefault(gradient.group, []).append(norm)
+        limits: dict[str, tuple[float, float]] = {}
+        for group, parts in squares.items():
+            norm = math.hypot(*parts)
+            if norm == 0:
+                continue  # nothing drawn: says nothing about the usual size
+            seen = self._norms.setdefault(group, deque(maxlen=WINDOW))
+            if len(seen) >= FEWEST:
+                limit = self.config.clip * statistics.median(seen)
+                if norm > limit:
+                    limits[group] = (norm, limit)
+                    norm = limit
+            seen.append(norm)
+        return limits
+
+
+def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
+    """Name of a tensor that holds a number that is none, or None."""
+    named = [Gradient(name, "", values) for name, values in tensors.items()]
+    return next(
+        (one.name for one, norm in zip(named, _norms(named), strict=True) if not math.isfinite(norm)),
+        None,
+    )
+
+
+def _norms(gradients: Sequence[Gradient]) -> list[float]:
+    """Euclidean norm of each tensor, not finite exactly where an entry is not."""
+    if not gradients:
+        return []
+    found: list[float] = torch.stack(list(torch._foreach_norm([one.values for one in gradients], 2))).tolist()
+    for index, norm in enumerate(found):
+        if not math.isfinite(norm):
+            # A float32 norm overflows from entries of 1e19 on, which are large and not yet wrong.
+            found[index] = float(torch.linalg.vector_norm(gradients[index].values.double()))
+    return found

@@ -1,0 +1,225 @@
+"""First anchors: from the capture's point cloud, or from random points that the masks allow (decision 3).
+
+Where the pictures show something everywhere, masks say nothing of where: places that pairs of pictures agree on, then.
+
+Knows nothing of networks' training; makes a scene that is ready for the first step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from graings.camera.sampling_rate import SamplingRate
+from graings.capture.capture import Capture
+from graings.capture.images import ImageStore
+from graings.config import TrainConfig
+from graings.random import RandomStreams
+from graings.scene.scaffold import Scaffold
+from graings.scene.scene import Scene
+from graings.training.curriculum.time_window import TimeWindow
+from graings.training.density.budget import most_anchors
+from graings.training.density.growth import voxel_keys
+from graings.training.initialization.triangulation import triangulate
+from graings.training.initialization.visual_hull import (
+    MIN_CARVED,
+    MIN_COVERAGE,
+    MIN_VIEWS,
+    WINDOW_FRACTIONS,
+    MaskedFrame,
+    carve,
+    check_not_empty,
+    coverage,
+    masked,
+)
+
+FEATURE_STD = 0.1
+
+# The finest cell in pixels at the scene's centre, of views as fine as the reference: on D-NeRF 0.005 of its units at
+# 400 px, 0.0025 at 800.
+VOXEL_PER_PIXEL = 0.7
+
+# Voting needs enough views to outvote a few wrong masks, not all of them.
+CARVING_VIEWS = 60
+
+# Pictures that show something in more than this share of their pixels do not say where there is nothing. Objects on a
+# background take a third at most (bouncingballs), a room all but what has the background's colour.
+FILLED = 0.7
+
+NEIGHBOURS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialScene:
+    """A scene ready for the first step."""
+
+    scene: Scene
+    voxel_size: float  # normalised units
+    time_window: float  # share of the clip that training begins with
+    notes: tuple[str, ...]  # what was decided on the way, in words
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialPoints:
+    """Positions [M, 3] to start from, the `time_window` they stand for, and what was decided, in words."""
+
+    positions: NDArray[np.float64]
+    time_window: float
+    notes: tuple[str, ...] = ()
+
+
+def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: RandomStreams) -> InitialScene:
+    """A scene of the first anchors. Raises `CaptureError` where no image shows anything."""
+    first = initial_points(capture, images, config, streams)
+    cameras = [frame.camera for frame in capture.train]
+    places = torch.from_numpy(first.positions)
+    voxel = config.init.voxel_size or VOXEL_PER_PIXEL / SamplingRate.of(cameras, content_extent(places)).reference
+    anchors = torch.unique(voxel_keys(places, voxel), dim=0).double() * voxel
+    extent = content_extent(anchors)  # where each place counts once, however many points a cloud has there
+    spacing = neighbour_distance(anchors.numpy()).clip(1e-4 * extent, 0.1 * extent)
+    generator = streams["init"]
+    count, scene = len(anchors), config.scene
+    scaffold = Scaffold(
+        anchors=anchors.float(),
+        log_scales=torch.from_numpy(np.log(spacing)).float().unsqueeze(-1).repeat(1, 3),
+        features=torch.randn(count, scene.feature_dim, generator=generator) * FEATURE_STD,
+        offsets=torch.randn(count, scene.children, 3, generator=generator) * config.init.offset_std,
+    )
+    made = Scene(
+        scene,
+        scaffold,
+        extent=extent,
+        sampling=SamplingRate.of(cameras, extent),
+        initial_opacity=config.init.opacity,
+        seed=config.seed,
+    )
+    return InitialScene(made, voxel, first.time_window, first.notes)
+
+
+def content_extent(points: Tensor) -> float:
+    """Radius about the origin that holds all but a hundredth of `points` [M, 3], normalised units; 1 where it is 0."""
+    return float(torch.quantile(points.norm(dim=-1).float(), 0.99)) or 1.0
+
+
+def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, streams: RandomStreams) -> InitialPoints:
+    """The capture's cloud, or else random points as far as the images allow them, or what pairs of images agree on.
+
+    The window is as configured, or else the widest in which the points still stand for what the images show.
+    """
+    generator = streams["init.points"]
+    window, most = config.time_window or 1.0, config.init.max_points
+    # What lies on surfaces stays: more of it than may grow would leave no room for what moves. Carved points lie inside
+    # of things, and most of them soon go.
+    lasting = min(most, most_anchors(config))
+    if capture.points is not None:
+        return InitialPoints(_subsampled(capture.points.positions, lasting, generator), window)
+    half = content_half_size(capture)
+    cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
+    if config.init.min_mask_fraction == 0:
+        return InitialPoints(_subsampled(cube, most, generator), window)
+    order = torch.randperm(len(capture.train), generator=generator).tolist()
+    whole = _voters(capture, images, config, order, 1.0)
+    check_not_empty(whole)  # in a part of the clip all may be out of sight
+    notes: tuple[str, ...] = ()
+    if np.mean([view.mask.mean() for view in whole]) > FILLED:
+        places, notes = _agreed(capture, images)
+        if places is not None:
+            return InitialPoints(_subsampled(places, lasting, generator), window, notes)
+    carved, window = _carved(cube, order, whole, capture, images, config) or (cube, window)
+    return InitialPoints(_subsampled(carved, most, generator), window, notes)
+
+
+def _agreed(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """What pairs of pictures agree on, None where that is too little; and what becomes of it, in words."""
+    try:
+        found = triangulate(capture.train, images)
+    except ImportError:
+        hint = "pip install graings[colmap] takes them from what the pictures have in common"
+        return None, (f"first points: random, for the pictures are filled and there is no cloud; {hint}",)
+    count = len(found.places)
+    if count < MIN_CARVED:
+        return None, (f"first points: random, for pairs of pictures agree on {count} places only",)
+    said = f"first points: {count:,} places that pairs of pictures agree on, and {len(found.filled):,} between them"
+    return np.concatenate([found.places, found.filled]), (said,)
+
+
+def _voters(
+    capture: Capture, images: ImageStore, config: TrainConfig, order: Sequence[int], share: float
+) -> list[MaskedFrame]:
+    """What the first views in `order` show of those in the middle `share` of the clip."""
+    window = TimeWindow(config, [frame.time for frame in capture.train], share)
+    chosen = sorted([view for view in order if window.has(view, 0)][:CARVING_VIEWS])
+    return masked([capture.train[view] for view in chosen], images, config.capture.background_rgb())
+
+
+def _subsampled(points: NDArray[np.float64], most: int, generator: torch.Generator) -> NDArray[np.float64]:
+    """At most `most` of `points` [M, 3], in their order."""
+    if len(points) <= most:
+        return points
+    return points[np.sort(torch.randperm(len(points), generator=generator)[:most].numpy())]
+
+
+def _carved(
+    cube: NDArray[np.float64],
+    order: Sequence[int],
+    whole: Sequence[MaskedFrame],
+    capture: Capture,
+    images: ImageStore,
+    config: TrainConfig,
+) -> tuple[NDArray[np.float64], float] | None:
+    """What the images leave of `cube`, the first views in `order` voting, and the share of the clip; None: nothing.
+
+    `whole` are the voters of all of the clip.
+    """
+    # A cell of a picture is a little less than the points' spacing as it appears there.
+    cells = math.ceil(1.25 * len(cube) ** (1 / 3))
+    best, most = None, -1.0
+    for share in WINDOW_FRACTIONS if config.time_window is None else [config.time_window]:
+        views = whole if share == 1 else _voters(capture, images, config, order, share)
+        if config.time_window is None and share < 1 and len(views) < MIN_VIEWS:
+            break
+        kept = carve(cube, views, config.init.min_mask_fraction, cells)
+        if len(kept) < MIN_CARVED:
+            continue
+        covered = coverage(kept, views, cells)
+        if covered > most:
+            best, most = (kept, share), covered
+        if covered >= MIN_COVERAGE:
+            break
+    return best
+
+
+def content_half_size(capture: Capture) -> float:
+    """Half-size of the cube for random points: what the median camera sees at the scene's centre.
+
+    For D-NeRF (distance 4, 40 degrees) this is 1.44 units, close to the customary 1.3.
+    """
+    half = [
+        float(np.linalg.norm(frame.camera.center))
+        * 0.5
+        * min(frame.camera.width / frame.camera.fx, frame.camera.height / frame.camera.fy)
+        for frame in capture.train
+    ]
+    return max(float(np.median(half)), 1e-3)
+
+
+def neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Root mean squared distance to the three nearest neighbours, [M]; 1 for a single point."""
+    count = len(points)
+    if count < 2:
+        return np.ones(count)
+    k = min(NEIGHBOURS, count - 1)
+    tensor = torch.from_numpy(points)
+    result = np.empty(count)
+    chunk = max(1, 20_000_000 // count)
+    for start in range(0, count, chunk):
+        distances = torch.cdist(tensor[start : start + chunk], tensor, compute_mode="donot_use_mm_for_euclid_dist")
+        nearest = distances.topk(k + 1, dim=-1, largest=False).values[:, 1:]
+        result[start : start + chunk] = nearest.square().mean(-1).sqrt().numpy()
+    return result

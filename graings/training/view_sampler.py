@@ -1,0 +1,28 @@
+"""ViewSampler: the order in which training looks at its views."""
+
+from __future__ import annotations
+
+import torch
+
+
+class ViewSampler:
+    """Training views without replacement: every view once, in a new random order each round."""
+
+    def __init__(self, count: int, generator: torch.Generator) -> None:
+        if count < 1:
+            raise ValueError(f"count must be at least 1, got {count}")
+        self.count = count
+        self.generator = generator
+        self.remaining = torch.empty(0, dtype=torch.int64)
+
+    def begin(self) -> None:
+        """Begin a new round, whatever is left of this one."""
+        self.remaining = torch.randperm(self.count, generator=self.generator)
+
+    def next(self) -> int:
+        """Index of the next view."""
+        if len(self.remaining) == 0:
+            self.begin()
+        index = int(self.remaining[0])
+        self.remaining = self.remaining[1:]
+        return index

@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.capture.synthetic import write_synthetic
+from graings.config import CaptureConfig
+from graings.evaluation.evaluate import evaluate
+from graings.evaluation.metrics import (
+    VGG_FILE,
+    Lpips,
+    SplitMetrics,
+    _backbone_problem,
+    measure,
+    measure_split,
+    psnr,
+    ssim_3dgs,
+)
+from tests.models import tiny_scene
+
+
+def noise(seed: int, height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(seed).random((height, width, 3))
+
+
+def ssim_by_the_book(x: np.ndarray, y: np.ndarray) -> float:
+    """Eq. 13 of Wang et al. written as one weighted sum per pixel, with nothing beyond the border."""
+    u = np.arange(-5, 6)
+    window = np.exp(-(u[:, None] ** 2 + u[None, :] ** 2) / (2 * 1.5**2))
+    window /= window.sum()
+    total = []
+    for row, column, channel in np.ndindex(x.shape):
+        moments = np.zeros(5)
+        for i, j in np.ndindex(11, 11):
+            r, c = row + i - 5, column + j - 5
+            if 0 <= r < x.shape[0] and 0 <= c < x.shape[1]:
+                a, b = x[r, c, channel], y[r, c, channel]
+                moments += window[i, j] * np.array([a, b, a * a, b * b, a * b])
+        ma, mb, aa, bb, ab = moments
+        total.append(
+            ((2 * ma * mb + 1e-4) * (2 * (ab - ma * mb) + 9e-4))
+            / ((ma**2 + mb**2 + 1e-4) * (aa - ma**2 + bb - mb**2 + 9e-4))
+        )
+    return float(np.mean(total))
+
+
+def test_psnr_of_a_known_error_is_its_closed_form() -> None:
+    target = np.full((4, 5, 3), 100.0 / 255.0)
+    assert math.isclose(psnr(target + 10.0 / 255.0, target), 20.0 * math.log10(25.5), rel_tol=1e-12)
+
+
+def test_psnr_sees_what_eight_bits_hold() -> None:
+    target = np.full((2, 2, 3), 100.0 / 255.0)
+    assert psnr(target + 0.4 / 255.0, target) == 100.0
+    assert psnr(target + 0.6 / 255.0, target) == psnr(target + 1.0 / 255.0, target)
+    assert psnr(np.full((2, 2, 3), 7.0), np.ones((2, 2, 3))) == 100.0
+
+
+def test_black_against_white_is_zero_decibels_and_not_similar() -> None:
+    black, white = np.zeros((16, 16, 3)), np.ones((16, 16, 3))
+    assert psnr(black, white) == 0.0
+    assert 0.0 <= ssim_3dgs(black, white) < 1e-3
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 5), (13, 17)])
+def test_ssim_equals_the_definition_written_out_per_pixel(size: tuple[int, int]) -> None:
+    # Values that eight bits hold exactly: rounding is the same on both sides.
+    x, y = (np.rint(noise(seed, *size) * 255.0) / 255.0 for seed in (1, 2))
+    assert math.isclose(ssim_3dgs(x, y), ssim_by_the_book(x, y), rel_tol=0, abs_tol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (40, 30)])
+def test_ssim_of_equal_images_is_one(size: tuple[int, int]) -> None:
+    assert abs(ssim_3dgs(noise(0, *size), noise(0, *size)) - 1.0) < 1e-12
+
+
+def test_ssim_of_flat_images_stays_at_one_in_spite_of_cancelling_variances() -> None:
+    flat = np.full((24, 24, 3), 0.6)
+    assert abs(ssim_3dgs(flat, flat + 1e-7) - 1.0) < 1e-9
+
+
+def test_tensors_and_arrays_measure_the_same() -> None:
+    x, y = noise(3, 20, 20).astype(np.float32), noise(4, 20, 20).astype(np.float32)
+    assert measure("v", 0.5, torch.from_numpy(x), torch.from_numpy(y)) == measure("v", 0.5, x, y)
+
+
+@pytest.mark.parametrize(
+    ("image", "target", "message"),
+    [
+        (np.zeros((4, 4)), np.zeros((4, 4)), r"image must have shape \(H, W, 3\)"),
+        (np.zeros((4, 4, 3)), np.zeros((4, 4, 4)), "target must have shape"),
+        (np.zeros((4, 4, 3)), np.zeros((4, 5, 3)), "same size"),
+        (np.zeros((0, 4, 3)), np.zeros((0, 4, 3)), "image must have shape"),
+        (np.full((4, 4, 3), np.nan), np.zeros((4, 4, 3)), "image must be finite"),
+    ],
+)
+def test_what_is_no_pair_of_images_is_refused(image: np.ndarray, target: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        measure("v", 0.0, image, target)
+
+
+def test_a_split_averages_decibels_and_not_errors() -> None:
+    target = np.full((4, 4, 3), 100.0 / 255.0)
+    pairs = [(f"v{k}", 0.0, target + k / 255.0, target) for k in (1, 10)]
+    split = measure_split(pairs)
+    expected = 20.0 * math.log10(255.0) - 10.0  # the mean of 20 log 255 and 20 log 25.5
+    assert split.psnr is not None
+    assert math.isclose(split.psnr, expected, rel_tol=1e-12)
+    assert not split.saturated
+
+
+def test_a_perfect_image_marks_its_split_as_saturated() -> None:
+    x = noise(5, 8, 8)
+    split = measure_split([("same", 0.0, x, x), ("other", 1.0, x, noise(6, 8, 8))])
+    assert split.saturated
+    assert split.views[0].psnr == 100.0
+
+
+def test_an_empty_split_has_no_numbers_but_a_reason() -> None:
+    document = json.loads(json.dumps(SplitMetrics.over(()).to_json(), allow_nan=False))
+    assert (document["psnr"], document["ssim_3dgs"], document["lpips_vgg"]) == (None, None, None)
+    assert "no images" in document["reason"]
+    assert document["views"] == []
+
+
+def test_absent_perceptual_weights_are_named_and_never_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    lpips = Lpips.find()
+    assert lpips.reason is not None
+    assert lpips(noise(0, 40, 40), noise(1, 40, 40)) is None
+    split = measure_split([("v", 0.0, noise(0, 40, 40), noise(1, 40, 40))], lpips)
+    assert split.lpips_vgg is None
+    assert split.lpips_reason == lpips.reason
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_perceptual_weights_are_told_from_absent_ones(tmp_path: Path) -> None:
+    file = tmp_path / VGG_FILE
+    assert "not installed" in str(_backbone_problem(file))
+    file.write_bytes(b"half a download")
+    assert not hashlib.sha256(file.read_bytes()).hexdigest().startswith("397923af")
+    assert "damaged" in str(_backbone_problem(file))
+
+
+def test_images_too_small_for_the_network_have_no_perceptual_distance() -> None:
+    class OneForAll(torch.nn.Module):
+        def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+            return (a - b).abs().mean()
+
+    lpips = Lpips(OneForAll(), None)
+    small, large = (measure("v", 0.0, noise(0, n, n), noise(1, n, n), lpips) for n in (31, 32))
+    assert small.lpips_vgg is None
+    assert large.lpips_vgg is not None
+    split = SplitMetrics.over((small, large), lpips.reason)
+    assert split.lpips_vgg is None
+    assert "under 32 pixels" in str(split.lpips_reason)
+    assert SplitMetrics.over((large,), lpips.reason).lpips_vgg == large.lpips_vgg
+
+
+def test_without_a_distance_the_reason_is_that_none_was_asked_for(tmp_path: Path) -> None:
+    capture = load_capture(write_synthetic(tmp_path / "c", frames=4, size=40), CaptureConfig())
+    images = ImageStore((1.0, 1.0, 1.0), 64)
+    found = evaluate(tiny_scene(anchors=4), capture.train[:1], images, (1.0, 1.0, 1.0))
+    assert (found.lpips_vgg, found.lpips_reason) == (None, "LPIPS was not asked for")

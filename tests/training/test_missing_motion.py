@@ -1,0 +1,172 @@
+"""Training that has lost what flies begins again with a part of the clip."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from graings.capture.synthetic import Body, SyntheticScene, write_synthetic
+from graings.config import TrainConfig, make_config
+from graings.storage.checkpoint import load_model, load_state, newest_checkpoint
+from graings.training.curriculum.missing_motion import (
+    BLOCK,
+    CELLS,
+    CHECK_AT,
+    COLOR_DIFFERENCE,
+    MIN_STEPS,
+    RESTART_WINDOWS,
+    has_missing_object,
+    restart_window,
+)
+from graings.training.curriculum.restart import RestartState
+from graings.training.run import RunReport, TrainingRun
+from tests.training.micro import micro_config
+
+ITERATIONS = MIN_STEPS * 30_000 // CHECK_AT
+LATER = MIN_STEPS + 60
+
+
+def body(home: tuple[float, ...], swing: float, semi_axes: tuple[float, ...], colour: tuple[float, ...]) -> Body:
+    """A body that swings along x, farthest back at the middle of the clip."""
+    return Body(
+        home=np.array(home),
+        swing=np.array([swing, 0.0, 0.0]),
+        semi_axes=np.array(semi_axes),
+        axis=np.array([0.0, 0.0, 1.0]),
+        colors=np.array([colour, colour]) * [[1.0], [0.6]],
+        phases=np.full(6, math.pi / 2),
+    )
+
+
+def write_floored(folder: Path, monkeypatch: pytest.MonkeyPatch, size: int = 50) -> Path:
+    """A small red ball that flies far above a blue floor, which is behind it in most views."""
+    floor = body((0.0, 0.0, -0.5), 0.0, (1.5, 1.5, 0.15), (0.3, 0.4, 0.8))
+    ball = body((0.0, 0.0, -0.05), 0.8, (0.25, 0.25, 0.25), (0.8, 0.1, 0.1))
+    monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((floor, ball))))
+    return write_synthetic(folder, frames=48, size=size)
+
+
+def small(**options: Any) -> TrainConfig:
+    """A model too small for the clip."""
+    return micro_config(**{"iterations": ITERATIONS, "evaluation.first": 5_000, **options})
+
+
+def train(run: TrainingRun, until: int) -> list[RunReport]:
+    """Reports up to iteration `until`; the run is saved then."""
+    reports = []
+    for report in run:
+        reports.append(report)
+        if report.iteration == until:
+            break
+    run.save()
+    return reports
+
+
+def again(reports: list[RunReport]) -> list[int]:
+    """Where training began again."""
+    return [r.iteration for r in reports for event in r.events if event.startswith("time_window: begins again")]
+
+
+def test_a_lost_ball_makes_training_begin_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = write_floored(tmp_path / "c", monkeypatch)
+    config = small(**{"evaluation.first": 27, "evaluation.factor": 2.0})
+    run = TrainingRun.create(capture, tmp_path / "run", config)
+    reports = train(run, LATER)
+    assert again(reports) == [MIN_STEPS]
+    assert [report.iteration for report in reports] == list(range(1, LATER + 1))
+    assert {r.iterations for r in reports[:MIN_STEPS]} == {ITERATIONS}
+    assert {r.iterations for r in reports[MIN_STEPS:]} == {MIN_STEPS + ITERATIONS} == {run.iterations}
+    # The new attempt is a whole training, warmed up once more in the middle of the clip.
+    assert [b.iteration for a, b in pairwise(reports) if (a.phase, b.phase) == ("joint", "warmup")] == [MIN_STEPS + 1]
+    facts = load_state(newest_checkpoint(run.folder) or Path()).facts
+    assert facts["attempt"] == {"began": MIN_STEPS, "time_window": RESTART_WINDOWS[-1]}
+    assert (run.iteration, facts["trainer"]["iteration"]) == (LATER, LATER - MIN_STEPS)
+    middle = [e for r in reports for e in r.events if e.startswith("time_window: begins with the middle 25 %")]
+    assert len(middle) == 1
+    assert [point["iteration"] for point in facts["curve"]] == [27, 54, 108, 216, 432]
+    # What an attempt that was given up once had is not the best model of this one, however well it did.
+    assert facts["curve"][-1]["psnr"] < facts["curve"][-2]["psnr"]
+    assert load_model(run.folder / "checkpoints" / "best").iteration == 432
+
+
+def test_interrupted_before_and_after_it_is_the_unbroken_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = write_floored(tmp_path / "c", monkeypatch)
+    unbroken = TrainingRun.create(capture, tmp_path / "unbroken", small())
+    train(unbroken, LATER)
+    broken = tmp_path / "broken"
+    train(TrainingRun.create(capture, broken, small()), MIN_STEPS - 10)
+    found = []
+    for stop in (MIN_STEPS, MIN_STEPS + 30, LATER):
+        found += again(train(TrainingRun.resume(broken, threads=1), stop))
+    assert found == [MIN_STEPS]
+    one, other = (load_model(folder) for folder in (unbroken.folder, broken))
+    assert one.iteration == other.iteration == LATER
+    values = other.scene.state_dict()
+    assert all(torch.equal(value, values[name]) for name, value in one.scene.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"time_window": 1.0}, {"iterations": ITERATIONS - 3}, {"scene.deformation": "none", "scene.residual": False}],
+)
+def test_a_choice_a_short_run_and_a_model_without_time_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
+) -> None:
+    capture = write_floored(tmp_path / "c", monkeypatch)
+    assert again(train(TrainingRun.create(capture, tmp_path / "run", small(**options)), MIN_STEPS + 2)) == []
+
+
+def test_too_few_views_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = write_floored(tmp_path / "c", monkeypatch)
+    path = capture / "transforms_train.json"
+    document = json.loads(path.read_text())
+    document["frames"] = document["frames"][::2]  # 24, of which fewer than eight lie in a quarter of the clip
+    path.write_text(json.dumps(document))
+    assert again(train(TrainingRun.create(capture, tmp_path / "run", small()), MIN_STEPS + 2)) == []
+
+
+def test_what_is_trained_well_stays(tmp_path: Path) -> None:
+    capture = write_synthetic(tmp_path / "c", seed=1, frames=24, size=50)
+    config = make_config(
+        "draft", {"iterations": ITERATIONS, "threads": 1, "init.points": 20_000, "capture.max_side": 50}
+    )
+    assert again(train(TrainingRun.create(capture, tmp_path / "run", config), MIN_STEPS + 2)) == []
+
+
+def test_a_thing_is_lost_where_it_is_another_colour_all_over() -> None:
+    shown = torch.full((2 * CELLS, 4 * CELLS, 3), 0.5)  # cells of 4 px
+    cell = 4
+    rows, columns = slice(10 * cell, (10 + BLOCK) * cell), slice(7 * cell, (7 + BLOCK) * cell)
+    for change, wide, lost in (
+        (1.01 * COLOR_DIFFERENCE, 0, True),
+        (-1.01 * COLOR_DIFFERENCE, 0, True),
+        (0.99 * COLOR_DIFFERENCE, 0, False),
+        (0.5, 2, False),
+    ):
+        drawn = shown.clone()
+        drawn[rows, columns.start : columns.stop - wide, 1] += change
+        assert has_missing_object(drawn, shown) == lost
+    assert not has_missing_object(shown, shown)
+    assert not has_missing_object(torch.zeros(2, 90, 3), torch.ones(2, 90, 3))  # too flat for a block
+
+
+def test_an_attempt_has_a_window_of_its_own() -> None:
+    config = small()
+    assert RestartState().config(config) is config
+    other = RestartState(400, 0.25).config(config)
+    assert (other.iterations, other.time_window) == (ITERATIONS, 0.25)
+    assert RestartState.of({}) == RestartState()
+
+
+def test_the_narrowest_part_with_enough_views_is_begun_with() -> None:
+    config = small()
+    for count, part in ((200, 0.1), (60, 0.25), (20, None)):
+        assert restart_window(config, np.linspace(0, 1, count).tolist()) == part
+    assert restart_window(config, [0.0] * 100) is None  # a still

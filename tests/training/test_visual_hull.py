@@ -1,0 +1,220 @@
+"""Which points the images allow, and for how much of the clip."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean
+
+import numpy as np
+import pytest
+
+from graings.capture.capture import PointCloud
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.capture.synthetic import Array, Body, SyntheticScene, write_synthetic
+from graings.config import TrainConfig, make_config
+from graings.random import RandomStreams
+from graings.training.initialization.initial_scene import initial_points
+from graings.training.initialization.visual_hull import MIN_CARVED, MIN_COVERAGE, carve, coverage, masked
+from tests.capture.captures import without_alpha, write_image
+from tests.training.micro import GROWING, micro_trainer, quality, said, steps
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small ball that flies to and fro, three times its own width, and turns around at the middle of the clip."""
+    ball = _ball(np.zeros(3), np.array([0.8, 0.3, 0.0]), 0.24)
+    monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((ball,))))
+    return write_synthetic(tmp_path / "flight", frames=48, size=40)
+
+
+@pytest.fixture
+def accompanied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A large ball that stays in the middle, and well above it a small one that flies to and fro."""
+    still = _ball(np.zeros(3), np.zeros(3), 0.5)
+    small = _ball(np.array([0.0, 0.0, 0.9]), np.array([0.8, 0.3, 0.0]), 0.2)
+    monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((still, small))))
+    return write_synthetic(tmp_path / "accompanied", frames=48, size=40)
+
+
+def _ball(home: Array, swing: Array, radius: float) -> Body:
+    """A red ball that is farthest along its swing at the ends of the clip, and farthest back at its middle."""
+    return Body(
+        home=home,
+        swing=swing,
+        semi_axes=np.full(3, radius),
+        axis=np.array([0.0, 0.0, 1.0]),
+        colors=np.array([[0.8, 0.1, 0.1], [0.3, 0.1, 0.1]]),
+        phases=np.full(6, math.pi / 2),
+    )
+
+
+def _draft(**options: object) -> TrainConfig:
+    """A draft that begins with every point that the images allow."""
+    return make_config("draft", {"init.points": 60_000, "init.max_points": 60_000, **options})
+
+
+def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
+    data = load_capture(capture, config.capture)
+    first = initial_points(data, ImageStore(WHITE), config, RandomStreams(0))
+    return len(first.positions), first.time_window
+
+
+def test_a_clip_in_which_nothing_stays_in_place_begins_with_a_part_of_it(flight: Path) -> None:
+    count, window = _found(flight, _draft())
+    assert 0.1 <= window < 1
+    assert 100 <= count < 6_000  # of 60 000
+    assert _found(flight, _draft(time_window=1.0)) == (60_000, 1.0)
+
+
+def test_no_more_points_are_first_anchors_than_may_be(flight: Path) -> None:
+    every, _ = _found(flight, _draft())
+    assert _found(flight, _draft(**{"init.max_points": 50}))[0] == 50 < every
+    data = load_capture(flight)
+    cloud = replace(data, points=PointCloud(_grid(), np.zeros_like(_grid(), np.float32)))
+    for capture in (data, cloud):
+        points, few = (
+            initial_points(capture, ImageStore(WHITE), _draft(**{"init.max_points": most}), RandomStreams(0)).positions
+            for most in (60_000, 50)
+        )
+        assert len(few) == 50
+        assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in points.tolist()}
+        # Points of a cloud lie on surfaces and stay: no more than may grow. Carved ones lie inside of things and go.
+        tight = _draft(**{"density.max_anchors": 100})
+        most = initial_points(capture, ImageStore(WHITE), tight, RandomStreams(0)).positions
+        assert len(most) == (100 if capture is cloud else every)
+
+
+def test_a_clip_in_which_things_stay_in_place_begins_as_a_whole(tmp_path: Path) -> None:
+    capture = write_synthetic(tmp_path / "c", seed=1, frames=24, size=40)
+    for options in ({}, {"time_window": 1.0}):
+        count, window = _found(capture, _draft(**options))
+        assert (count < 30_000, window) == (True, 1.0)
+
+
+def test_what_flies_is_not_lost(flight: Path) -> None:
+    gains = []
+    for seed in range(3):  # they lie a decibel apart
+        found = []
+        for options in ({}, {"time_window": 1.0}):
+            few = {"iterations": 400, "seed": seed, "init.points": 20_000}
+            trainer = micro_trainer(flight, **few, **GROWING, **options)
+            reports = steps(trainer, 400)
+            assert len(said(reports[:1], "time_window: begins with the middle")) == (0 if options else 1)
+            assert said(reports[1:], "time_window") == []
+            found.append(quality(trainer))
+        print(f"seed {seed}: by itself {found[0]:.2f} dB, the whole clip from the start {found[1]:.2f} dB")
+        gains.append(found[0] - found[1])
+    assert mean(gains) > 2
+
+
+def test_too_few_views_do_not_speak_for_a_part_of_the_clip(flight: Path) -> None:
+    config = make_config("draft")
+    data = load_capture(flight, config.capture)
+    few = replace(data, train=data.train[::4])
+    assert initial_points(few, ImageStore(WHITE), config, RandomStreams(0)).time_window == 1.0
+
+
+@pytest.mark.parametrize("window", [None, 0.25])
+def test_a_clip_with_nothing_in_sight_at_its_middle_is_not_taken_for_empty(flight: Path, window: float | None) -> None:
+    for frame in load_capture(flight).train:
+        if abs(frame.time - 0.5) < 0.3:
+            write_image(frame.image_path, np.zeros((40, 40, 4), np.uint8))
+    assert _found(flight, _draft(time_window=window)) == (60_000, window or 1.0)
+
+
+def test_what_looks_like_the_background_has_no_points(flight: Path) -> None:
+    data = load_capture(flight)
+    red, none = (masked(data.train[:4], ImageStore(colour), colour) for colour in (WHITE, (0.0, 0.0, 0.0)))
+    for one, other in zip(red, none, strict=True):
+        alpha = ImageStore(WHITE).alpha(one.frame)
+        assert alpha is not None
+        assert np.array_equal(one.mask, alpha > 0.5)
+        assert np.array_equal(one.mask, other.mask)
+    row, column = (int(index[0]) for index in red[0].mask.nonzero())
+    own = ImageStore(WHITE).rgb(data.train[0])[row, column].tolist()
+    assert masked(data.train[:1], ImageStore(WHITE), own)[0].mask.sum() < red[0].mask.sum()
+
+
+def test_pictures_without_alpha_show_what_is_not_of_the_background(flight: Path) -> None:
+    transparent = load_capture(flight).train[:4]
+    ours = masked(transparent, ImageStore(WHITE), WHITE)
+    without_alpha(flight)
+    flat = load_capture(flight).train[:4]
+    for one, other in zip(ours, masked(flat, ImageStore(WHITE), WHITE), strict=True):
+        assert (one.mask & ~other.mask).sum() == 0  # a rim that is half there counts too
+        assert one.mask.sum() <= other.mask.sum() < 2 * one.mask.sum() < one.mask.size / 5
+    assert all(view.mask.all() and view.opaque for view in masked(flat, ImageStore(WHITE), (0.0, 0.0, 1.0)))
+
+
+def test_without_alpha_a_clip_begins_with_as_few_points_and_the_same_part_of_it(flight: Path) -> None:
+    count, window = _found(flight, _draft())
+    without_alpha(flight)
+    flat, same = _found(flight, _draft())
+    assert same == window
+    assert count <= flat < 1.5 * count
+
+
+def test_pictures_of_the_background_alone_leave_all_points(flight: Path) -> None:
+    for frame in load_capture(flight).train:
+        write_image(frame.image_path, np.full((40, 40, 3), 255, np.uint8))
+    assert _found(flight, _draft()) == (60_000, 1.0)
+
+
+def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
+    data = load_capture(flight)
+    views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
+    kept = carve(_grid(), views, 0.6, 50)
+    assert 0 < len(kept) < 0.05 * len(_grid())
+    assert coverage(kept, views, 50) > MIN_COVERAGE
+    assert coverage(kept + 5, views, 50) == 0
+    assert coverage(kept[:1], views, 50) < coverage(kept, views, 50)
+
+
+def test_what_stands_still_has_no_fog_about_it_and_what_flies_beside_it_keeps_its_points(accompanied: Path) -> None:
+    data = load_capture(accompanied)
+    views = masked(data.train[16:32], ImageStore(WHITE), WHITE)
+    found = []
+    for points in (carve(_grid(), views, 0.6, 1), carve(_grid(), views, 0.6, 50)):  # every point is near to one cell
+        fog = np.linalg.norm(data.units.points_back(points), axis=-1) > 0.7  # the ball that stays has a radius of 0.5
+        found.append((int(fog.sum()), len(points), coverage(points, views, 50)))
+    (_, _, bare), (fog_left, count, covered) = found
+    assert bare < 0.8 < 0.95 < covered
+    assert fog_left < 0.1 * count
+
+
+def test_where_few_points_would_be_left_all_that_are_allowed_stay(flight: Path) -> None:
+    data = load_capture(flight)
+    views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
+    many, few = (len(carve(_grid()[::step], views, 0.6, 50)) * step for step in (1, 8))
+    assert few >= 8 * MIN_CARVED
+    assert few > 1.5 * many
+
+
+def test_a_small_thing_without_points_is_not_covered_by_a_large_one(accompanied: Path) -> None:
+    data = load_capture(accompanied)
+    places = data.units.points_back(_grid())
+    large = np.linalg.norm(places, axis=-1) < 0.5
+    small = np.linalg.norm(places - (0.8, 0.3, 0.9), axis=-1) < 0.2  # where it is at the ends of the clip
+    ends = masked([data.train[0], data.train[-1]] * 20, ImageStore(WHITE), WHITE)
+    middle = masked(data.train[24:25], ImageStore(WHITE), WHITE)
+    assert coverage(_grid()[large | small], ends, 50) > 0.9
+    assert coverage(_grid()[large], ends, 50) == 0
+    assert coverage(_grid()[large | small], middle, 50) == 0
+    assert coverage(_grid()[large | small], ends + middle, 50) > 0.9  # one of many views may be wrong
+    assert coverage(_grid()[large | small], ends[:4] + middle, 50) < MIN_COVERAGE
+
+
+def test_a_small_thing_that_flies_is_reason_enough_to_begin_with_a_part_of_the_clip(accompanied: Path) -> None:
+    for seed in range(3):
+        data = load_capture(accompanied)
+        assert initial_points(data, ImageStore(WHITE), make_config("draft"), RandomStreams(seed)).time_window < 1
+
+
+def _grid() -> Array:
+    """Places [64000, 3] all over what the cameras see."""
+    return np.stack(np.meshgrid(*[np.linspace(-0.36, 0.36, 40)] * 3), axis=-1).reshape(-1, 3)
