@@ -25,7 +25,8 @@ from typing import Any
 from graings.config import TrainConfig, restored
 from graings.errors import DivergedError, GraingsError
 from graings.report.folder import report_runs
-from graings.training.run import RunReport, TrainingRun
+from graings.training.run import TrainingRun
+from graings.training.run_output import RunReport
 from jobs.exit_code import ExitCode
 from jobs.files import locked
 from jobs.parent import watch_parent

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
-from graings.training.run import RunReport
+from graings.training.run_output import RunReport
 from graings.training.training_log import EvaluationPoint
 
 

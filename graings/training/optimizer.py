@@ -198,10 +198,10 @@ class Optimizer:
         for key, value in state.items():
             name, _, field = key.rpartition("/")
             parameter = parameters[name]
-            if parameter not in places:
-                self.adam.state[parameter][field] = value.clone()
-            elif field == MOMENTUM_OF:  # older checkpoints hold Adam's moments here: their momentum begins anew
+            if field == MOMENTUM_OF:
                 self.muon.momenta[places[parameter]] = value.clone()
+            else:
+                self.adam.state[parameter][field] = value.clone()
 
 
 def _grow(moment: Tensor, new: Tensor) -> Tensor:

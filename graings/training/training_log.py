@@ -15,7 +15,6 @@ from typing import Any
 
 from graings.capture.capture import SPLITS, Capture
 from graings.config import TrainConfig
-from graings.evaluation.evaluate import frames_per_second, subset
 from graings.evaluation.metrics import SplitMetrics
 from graings.plan.plan import Plan
 from graings.report.folder import report_training
@@ -29,9 +28,6 @@ from graings.training.guard.stiffness import Stiffness
 from graings.training.timing import Clock
 
 SCHEMA = "graings.run/1"
-
-# Frames per second are measured on this many views.
-FPS_VIEWS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +100,7 @@ class TrainingLog:
     def load(self, state: dict[str, Any]) -> None:
         """Continue from what `state()` gave."""
         seconds = dict(state["seconds"])
-        self.clock = Clock(seconds, state.get("wall_s", sum(seconds.values())), state.get("train_cpu_s"))
+        self.clock = Clock(seconds, float(state["wall_s"]), state["train_cpu_s"])
         self.curve = list(state["curve"])
         self.events = list(state["events"])
         self.gaussians = int(state["gaussians"])
@@ -130,11 +126,13 @@ class TrainingLog:
     def write_metrics(
         self,
         iteration: int,
+        iterations_planned: int,
         scene: Scene,
         background: Sequence[float],
         guard: Guard,
         threads: int,
         splits: dict[str, Any],
+        render_fps: float | None,
         compact: dict[str, Any] | None = None,
         stiffness: Stiffness | None = None,
     ) -> None:
@@ -143,10 +141,6 @@ class TrainingLog:
         `splits` are the metrics of whole splits by name, `compact` the facts of the compact model and `stiffness` that
         of the end over all training views; they only exist once the run has ended.
         """
-        started = time.perf_counter()
-        fps = frames_per_second(scene, subset(self.capture.train, FPS_VIEWS), background)
-        machine = machine_facts(threads)
-        self.clock.add("report", time.perf_counter() - started)
         started = time.perf_counter()
         document = {
             "schema": METRICS_SCHEMA,
@@ -157,11 +151,12 @@ class TrainingLog:
             "wall_s": self.clock.wall_s(),
             "phases_s": dict(self.clock.seconds),
             "iterations": iteration,
+            "iterations_planned": iterations_planned,
             "gaussians": self.gaussians,
             "anchors": scene.scaffold.count,
             "bytes": {"fp32": scene_bytes(scene), "compact": None if compact is None else compact["bytes"]},
             "compact": compact,
-            "render_fps": fps,
+            "render_fps": render_fps,
             "curve": self.curve,
             "events": self.events,
             "plan": self.plan.to_json(),
@@ -179,7 +174,7 @@ class TrainingLog:
             "stiffness": None if stiffness is None else asdict(stiffness) | {"stiff": stiffness.stiff},
             "diverged": self.diverged is not None,
             "diverged_reason": self.diverged,
-            "machine": machine,
+            "machine": machine_facts(threads),
             "versions": self.versions,
             "seed": self.config.seed,
             "hashes": {"config": config_hash(self.config), "capture": self.capture.content_hash},

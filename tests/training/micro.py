@@ -18,9 +18,10 @@ from graings.kernel import use_threads
 from graings.raster.photometric import photometric
 from graings.render import draw
 from graings.scene.scene import Scene
-from graings.training import trainer as trainer_module
+from graings.training import objective as objective_module
 from graings.training.optimizer import Optimizer
-from graings.training.trainer import StepReport, Trainer
+from graings.training.step_report import StepReport
+from graings.training.trainer import Trainer
 
 # Nothing grows or goes unless a test wants it: parameters keep their identity.
 STILL = {"density.grow_from": 30_000, "density.grow_until": 0, "density.prune_from": 30_000, "density.prune_until": 0}
@@ -59,7 +60,7 @@ def micro_trainer(capture: Path, **overrides: object) -> Trainer:
     use_threads(1)
     data = load_capture(capture, config.capture)
     images = ImageStore(config.capture.background_rgb(), config.capture.cache_mb)
-    return Trainer(data, images, config)
+    return Trainer.start(data, images, config)
 
 
 def steps(trainer: Trainer, count: int) -> list[StepReport]:
@@ -115,13 +116,13 @@ def spoil_loss(
     monkeypatch: pytest.MonkeyPatch, trainer: Trainer, when: Callable[[int], bool], factor: float = float("nan")
 ) -> None:
     """Multiply the photometric loss by `factor` in the steps that `when` chooses."""
-    true = trainer_module.photometric
+    true = objective_module.photometric
 
     def spoiled(image: Tensor, target: Tensor, *weights: float) -> Tensor:
         value = true(image, target, *weights)
         return value * factor if when(trainer.iteration) else value
 
-    monkeypatch.setattr(trainer_module, "photometric", spoiled)
+    monkeypatch.setattr(objective_module, "photometric", spoiled)
 
 
 def first(values: Tensor, number: float) -> Tensor:

@@ -147,7 +147,7 @@ def test_a_scene_that_is_not_finite_is_never_saved(micro: Path, tmp_path: Path) 
     model = load_model(tmp_path / "run")
     assert model.iteration == 30
     assert all(bool(values.isfinite().all()) for values in model.scene.state_dict().values())
-    assert "rolled back to iteration 25: scaffold.features was not finite" in run._journal.events[-1]["what"]
+    assert "rolled back to iteration 25: scaffold.features was not finite" in run.log.events[-1]["what"]
 
 
 @pytest.mark.parametrize("file", ["scene.safetensors", "state.safetensors"])

@@ -77,7 +77,7 @@ def test_steps_see_small_pictures_first_and_then_the_photographs(micro: Path, mo
 
     monkeypatch.setattr(trainer.images, "rgb", noted)
     reports = steps(trainer, 40)
-    times = trainer.pyramid.at(1).times
+    times = trainer.pyramid.at(1).factor
     assert times > 1
     assert drawn[0] == (-(-side // times),) * 2
     assert drawn[19][0] < side
@@ -90,7 +90,7 @@ def test_a_small_picture_is_the_mean_of_what_its_pixels_cover(micro: Path) -> No
     trainer = _trainer(micro)
     level = trainer.pyramid.at(20)
     whole, small = trainer.images.rgb(trainer.capture.train[0]), trainer.images.rgb(level.frames[0])
-    assert level.times == 2
+    assert level.factor == 2
     np.testing.assert_allclose(small, shrink(whole, small.shape[1], small.shape[0]), atol=2 / 65535)
 
 

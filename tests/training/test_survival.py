@@ -134,7 +134,7 @@ def test_three_bad_steps_in_a_row_restore_scene_moments_streams_and_statistics(
     assert trainer.guard.skipped == 3
     # Half the rates, and views in an order of their own.
     assert trainer.optimizer.damping == 0.5
-    assert trainer.sampler.generator is trainer.streams["sampler.1"]
+    assert trainer.views.sampler.generator is trainer.streams["sampler.1"]
 
 
 def test_going_back_in_vain_goes_back_further_and_in_the_end_gives_up(

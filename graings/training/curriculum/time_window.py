@@ -19,7 +19,7 @@ class TimeWindow:
     """
 
     def __init__(self, config: TrainConfig, times: Sequence[float], first: float) -> None:
-        self._first = first
+        self.first = first
         self._from, self._until = config.scaled(config.warmup), config.scaled(config.time_window_until)
         self._apart = [2 * abs(time - 0.5) for time in times]
         self._nearest = min(self._apart)
@@ -27,9 +27,9 @@ class TimeWindow:
     def share(self, iteration: int) -> float:
         """Share of the clip that takes part: as it begins until the warm-up ends, then widening evenly to 1."""
         if iteration <= self._from:
-            return self._first
+            return self.first
         progress = (iteration - self._from) / max(1, self._until - self._from)
-        return min(1.0, self._first + (1.0 - self._first) * progress)
+        return min(1.0, self.first + (1.0 - self.first) * progress)
 
     def has(self, view: int, iteration: int) -> bool:
         """Whether `view` takes part at `iteration`."""

@@ -6,13 +6,16 @@ nothing of images, losses or guards.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from graings.capture.capture import Frame
 from graings.config import TrainConfig
-from graings.scene.scene import Scene
+from graings.raster.result import RenderResult
+from graings.scene.scene import Composition, Scene
 from graings.training.density import growth
 from graings.training.density.budget import most_anchors
 from graings.training.density.statistics import DensityStatistics
@@ -43,6 +46,24 @@ class DensityControl:
         last_growth = self.scaled(self.config.grow_until)
         growing = self.scaled(self.config.statistics_from) < iteration <= last_growth
         return growing or last_growth < iteration <= self.scaled(self.config.prune_until)
+
+    def observe(
+        self,
+        frames: Sequence[Frame],
+        compositions: Sequence[Composition],
+        results: Sequence[RenderResult],
+        offsets: Sequence[Tensor],
+    ) -> None:
+        """Record the views of one step; `offsets` hold dL/d(projected centre), L being the mean over views."""
+        for frame, composition, result, offset in zip(frames, compositions, results, offsets, strict=True):
+            if offset.grad is not None:
+                self.statistics.observe(
+                    composition.children,
+                    offset.grad * len(frames),  # of the view's own loss, not of the mean
+                    result.radii.amax(-1) > 0,
+                    composition.opacities,
+                    (frame.camera.width, frame.camera.height),
+                )
 
     def grows(self, iteration: int) -> bool:
         """Whether anchors may be added after `iteration`."""

@@ -22,7 +22,7 @@ from graings.capture.capture import Frame
 from graings.gaussians import Gaussians
 from graings.render import draw, low_pass
 from graings.scene.children import quaternion_product
-from graings.scene.scene import Scene
+from graings.scene.scene import Composition, Scene
 
 # Share of Gaussians whose step is no longer than `step_over_size` says.
 SHARE: Final = 0.99
@@ -84,23 +84,39 @@ def step_over_size(before: Gaussians, after: Gaussians, camera: Camera, blur: fl
     return float(np.quantile(lengths.numpy(), SHARE)) if bool(lengths.isfinite().all()) else None
 
 
+class SubpixelCounter:
+    """f_sub: share of the Gaussians seen in a set of views whose footprint is below 0.1 px in all of them."""
+
+    def __init__(self, scene: Scene) -> None:
+        slots = scene.scaffold.count * scene.scaffold.slots
+        self._seen = torch.zeros(slots, dtype=torch.bool)
+        self._wide = torch.zeros(slots, dtype=torch.bool)
+        self.views = 0
+
+    @torch.no_grad()
+    def add(self, composition: Composition, radii: Float[Tensor, "gaussian 2"], camera: Camera) -> None:
+        """Count one view that was drawn with `radii`."""
+        gaussians = composition.gaussians
+        visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
+        self._seen[composition.children[visible]] = True
+        sizes = footprints(gaussians, radii, low_pass(composition, camera))
+        self._wide[composition.children[visible & (sizes >= SUBPIXEL)]] = True
+        self.views += 1
+
+    def share(self) -> float | None:
+        """The share over the views so far; None where no Gaussian was seen."""
+        count = int(self._seen.sum())
+        return int((self._seen & ~self._wide).sum()) / count if count else None
+
+
 @torch.no_grad()
 def subpixel_share(scene: Scene, frames: Sequence[Frame], background: Sequence[float]) -> float | None:
-    """f_sub: share of the Gaussians seen in `frames` whose footprint stays below a tenth of a pixel in all of them.
-
-    None where none is seen.
-    """
-    slots = scene.scaffold.count * scene.scaffold.slots
-    seen, wide = torch.zeros(slots, dtype=torch.bool), torch.zeros(slots, dtype=torch.bool)
+    """f_sub over the views `frames`, each drawn once."""
+    counter = SubpixelCounter(scene)
     for frame in frames:
         composition = scene.compose(frame.camera.center, frame.time)
-        gaussians, radii = composition.gaussians, draw(composition, frame.camera, background).radii
-        visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
-        seen[composition.children[visible]] = True
-        sizes = footprints(gaussians, radii, low_pass(composition, frame.camera))
-        wide[composition.children[visible & (sizes >= SUBPIXEL)]] = True
-    count = int(seen.sum())
-    return int((seen & ~wide).sum()) / count if count else None
+        counter.add(composition, draw(composition, frame.camera, background).radii, frame.camera)
+    return counter.share()
 
 
 def footprints(gaussians: Gaussians, radii: Float[Tensor, "gaussian 2"], blur: float) -> Float[Tensor, " gaussian"]:
