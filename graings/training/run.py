@@ -196,7 +196,7 @@ class TrainingRun:
         """
         trainer, before = self._trainer, self._restart.iterations_before
         chosen = self.applied.time_window is not None or trainer.window.share(1) < 1
-        if self.iteration != missing_motion.look_at(self.applied) or before > 0 or chosen:
+        if self.iteration != missing_motion.check_iteration(self.applied) or before > 0 or chosen:
             return ()
         window = missing_motion.restart_window(self.applied, [frame.time for frame in self.capture.train])
         if window is None or not trainer.scene.temporal:

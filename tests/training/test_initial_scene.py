@@ -90,10 +90,10 @@ def _first(capture: Capture, **options: object) -> InitialPoints:
 
 def test_filled_pictures_begin_with_what_pairs_of_them_agree_on(filled: Capture) -> None:
     found = triangulate(filled.train, ImageStore(WHITE))
-    agreed = np.concatenate([found.places, found.filled])
+    agreed = np.concatenate([found.points, found.filled])
     first = _first(filled)
     np.testing.assert_array_equal(first.positions, agreed)
-    counts = len(found.places), len(found.filled)
+    counts = len(found.points), len(found.filled)
     assert first.notes == (
         f"first points: {counts[0]:,} places that pairs of pictures agree on, and {counts[1]:,} between them",
     )

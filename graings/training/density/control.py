@@ -1,7 +1,6 @@
-"""DensityControl: when anchors are watched, grown and pruned over a run, and what that needs to remember.
+"""DensityControl: the schedule of observing, growing and pruning anchors.
 
-`density` decides which; this asks it when the schedule says so and has scene, optimizer and statistics follow. Knows
-nothing of images, losses or guards.
+`growth` decides which anchors; this module applies the decisions to scene, optimiser and statistics.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from graings.training.density.statistics import DensityStatistics
 from graings.training.guard.collapse import mean_logits
 from graings.training.optimizer import Optimizer
 
-# With more of the anchors' budget taken than this, growth first removes those that show nothing.
+# Above this share of the budget, growth first prunes faint anchors.
 NEAR_BUDGET = 0.9
 
-# Where more anchors stand than may, and nine tenths of them have been seen often enough for what shows nothing to have
-# gone, those that are left are thinned to this share of the budget. Nothing could be born for the rest of the run.
+# Where the initial anchors exceed the budget and nine tenths of them were visited often enough to be pruned, the rest
+# is thinned to this share of the budget: otherwise no anchor could be added for the rest of the run.
 MIN_OBSERVED_FRACTION = 0.9
 THINNED_FRACTION = 0.5
 
@@ -42,7 +41,7 @@ class DensityControl:
         self.statistics = DensityStatistics(scene.scaffold.count, scene.scaffold.slots)
 
     def watches(self, iteration: int) -> bool:
-        """Whether what `iteration` draws counts for the next growth or pruning."""
+        """Whether `iteration` is observed for the next growth or pruning."""
         last_growth = self.scaled(self.config.grow_until)
         growing = self.scaled(self.config.statistics_from) < iteration <= last_growth
         return growing or last_growth < iteration <= self.scaled(self.config.prune_until)
@@ -71,18 +70,18 @@ class DensityControl:
         return first <= iteration <= last and iteration % self.config.grow_every == 0
 
     def prunes(self, iteration: int) -> bool:
-        """Whether anchors that show nothing go after `iteration`."""
+        """Whether faint anchors are removed after `iteration`."""
         first, last = self.scaled(self.config.prune_from), self.scaled(self.config.prune_until)
         return first <= iteration <= last and iteration % max(1, self.scaled(self.config.prune_every)) == 0
 
     def grow(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> tuple[int, list[str]]:
-        """Add anchors where the pictures ask for them; returns how many, and what happened in words."""
+        """Add anchors where the projected centres have large gradients; returns how many, and the events."""
         events: list[str] = []
-        # Anchors that show nothing would keep others from growing for good: what is not drawn does not come back.
+        # Faint anchors would use up the budget for good: what is not drawn gets no gradient and does not recover.
         if scene.scaffold.count > NEAR_BUDGET * self.config.max_anchors:
-            judged = float((self.statistics.visits > self.config.prune_min_views).double().mean())
+            visited = float((self.statistics.visits > self.config.prune_min_views).double().mean())
             events = self.prune(scene, optimizer)
-            if judged > MIN_OBSERVED_FRACTION and scene.scaffold.count > self.config.max_anchors:
+            if visited > MIN_OBSERVED_FRACTION and scene.scaffold.count > self.config.max_anchors:
                 events += self._thin(scene, optimizer, generator)
         grown = growth.grow(
             scene.scaffold,
@@ -93,7 +92,7 @@ class DensityControl:
             self.next_uid,
             generator,
         )
-        self.statistics.forget_grown(self.config.min_observations)
+        self.statistics.reset_grown(self.config.min_observations)
         if grown.capped:
             events.append("growth_capped: the budget of anchors is used up or too many wanted to grow")
         if len(grown) > 0:
@@ -106,7 +105,7 @@ class DensityControl:
     def prune(self, scene: Scene, optimizer: Optimizer) -> list[str]:
         """Remove anchors that show nothing; returns what happened, in words."""
         keep = growth.prune(scene.scaffold, self.statistics, self.config)
-        self.statistics.forget_judged(self.config.prune_min_views)
+        self.statistics.reset_pruned(self.config.prune_min_views)
         removed = int((~keep).sum())
         if removed == 0:
             return []

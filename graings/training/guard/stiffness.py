@@ -1,7 +1,8 @@
-"""Stiffness: whether the optimiser's steps fit the sizes of what they move, and how much is too small for any view.
+"""Stiffness: the length of the optimiser's steps relative to the Gaussians they move, and the share of Gaussians
+too small for any view.
 
-Steps longer than the Gaussians they move shake a scene instead of shaping it, and the scales of a Gaussian far smaller
-than a pixel get next to no gradient: the low-pass of the footprint hides them. Knows nothing of schedules or losses.
+Steps longer than the Gaussians they move make training oscillate. The scales of a Gaussian far smaller than a pixel
+get next to no gradient, because the low-pass filter dominates its footprint.
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ from graings.scene.scene import Composition, Scene
 # Share of Gaussians whose step is no longer than `step_over_size` says.
 SHARE: Final = 0.99
 
-# Above this a step is longer than what it moves.
+# Above this a step is longer than the Gaussian it moves.
 STIFF: Final = 1.0
 
 # A footprint below this many px, both axes together, is too small for its scales to be learned.
 SUBPIXEL: Final = 0.1
 
-# Fainter Gaussians count as unseen: their footprint ends where it begins.
+# Below this opacity the footprint is too small to be measured: such Gaussians count as not seen.
 SEEN: Final = 2 * constants.ALPHA_MIN
 
 
 @dataclass(frozen=True, slots=True)
 class Stiffness:
-    """What one moment of training says: kappa_step and f_sub, None where nothing was measured or is drawn.
+    """kappa_step and f_sub at one iteration; None where nothing was measured or drawn.
 
     `views` is how many training views `subpixel_share` looked at.
     """
@@ -50,7 +51,7 @@ class Stiffness:
 
     @property
     def stiff(self) -> bool:
-        """Whether the last step that was measured was too long for the scene."""
+        """Whether the last measured step was longer than the Gaussians it moved."""
         return self.step_over_size is not None and self.step_over_size > STIFF
 
     def events(self) -> tuple[str, ...]:
@@ -64,11 +65,11 @@ class Stiffness:
 
 
 def step_over_size(before: Gaussians, after: Gaussians, camera: Camera, blur: float) -> float | None:
-    """kappa_step: how far one step moved Gaussians over their own size in that direction, 99th percentile.
+    """kappa_step: how far one step moved Gaussians, over their size in that direction, 99th percentile.
 
-    The size is what `camera` can see of it, with the low-pass of the footprint (`blur`, px^2) at its distance: a disc
-    thinner than any pixel, moved by its own thickness, moves nothing. Of those drawn both times, known by their uids;
-    None where there are none, or where one of them is lost. Both are of the same instant.
+    The size includes the low-pass filter (`blur`, px^2) of `camera` at its distance: a disc much thinner than a pixel
+    that moves by its own thickness changes no pixel. Both sets are of the same time; Gaussians drawn in both, matched
+    by uid, count. None where there are none, or one is not finite.
     """
     uids = (before.uids.numpy(), after.uids.numpy())
     _, here, there = np.intersect1d(*uids, assume_unique=True, return_indices=True)
