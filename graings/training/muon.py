@@ -35,7 +35,7 @@ ADAM_RMS: Final = 0.2
 
 
 class Muon:
-    """The optimiser of weight matrices; `momenta` are running means of their gradients, in the order of `parameters`."""
+    """The optimiser of weight matrices; `momenta` are running means of gradients, in the order of `parameters`."""
 
     def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
         for parameter in parameters:
