@@ -13,6 +13,7 @@ PACKAGES = ("graings", "jobs", "service")
 GROUND = (
     "graings",
     "graings.constants",
+    "graings.document",
     "graings.errors",
     "graings.gaussians",
     "graings.image_encoding",
