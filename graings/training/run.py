@@ -16,20 +16,22 @@ from graings.capture.background import with_background
 from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
-from graings.config import TrainConfig, restored
+from graings.config import TrainConfig
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation.evaluate import subset
 from graings.kernel import computing_threads
 from graings.plan.plan import Plan, make_plan
-from graings.report.report import read_metrics
+from graings.report.events import Diverged, Event, Restarted
+from graings.report.metrics_document import METRICS_FILE, EvaluationPoint, read_metrics
+from graings.report.run_record import read_record
 from graings.storage.checkpoint import best_checkpoint, load_model, load_state, load_training, newest_checkpoint
-from graings.storage.run_folder import RECORD_FILE, read_record, sole_trainer
+from graings.storage.run_folder import RECORD_FILE, sole_trainer
 from graings.training.curriculum import missing_motion
 from graings.training.curriculum.restart import RestartState
 from graings.training.run_output import RunOutput, RunReport, psnr_of_best
 from graings.training.timing import Clock, Rate, evaluation_marks
 from graings.training.trainer import Trainer
-from graings.training.training_log import EvaluationPoint, TrainingLog
+from graings.training.training_log import TrainingLog
 
 
 class TrainingRun:
@@ -80,11 +82,11 @@ class TrainingRun:
         run or the capture is another one.
         """
         record = read_record(folder)
-        config = restored(TrainConfig, record.config, folder / RECORD_FILE)
+        config = record.config
         clock = Clock()
         started = time.perf_counter()
-        data = load_capture(capture or record.capture, config.capture)
-        if data.content_hash != record.capture_hash:
+        data = load_capture(capture or record.capture.path, config.capture)
+        if data.content_hash != record.capture.hash:
             raise CheckpointError(f"{data.root}: not the capture this run began with. Give the original one.")
         clock.add("load", time.perf_counter() - started)
         run = cls(folder, data, config, threads, clock)
@@ -130,7 +132,7 @@ class TrainingRun:
     @property
     def metrics_path(self) -> Path:
         """Where the metrics document is."""
-        return self.folder / "metrics.json"
+        return self.folder / METRICS_FILE
 
     def __iter__(self) -> Iterator[RunReport]:
         with sole_trainer(self.folder), computing_threads(self.threads):
@@ -150,12 +152,12 @@ class TrainingRun:
             self.log.clock.add(step.phase, step.seconds, step.cpu_s)
             self.log.gaussians = step.gaussians
             rate.add(step.seconds)
-            self.log.note(self.iteration, step.events)
+            self.log.note(step.events)
             last = step.iteration == self.iterations
             saving = step.iteration % self.config.evaluation.checkpoint_every == 0
             evaluating = step.iteration in evaluation_marks(self.config, self.iterations)
             # A scene with a NaN is never evaluated or saved.
-            events = self._check() if last or saving or evaluating else ()
+            events: tuple[Event, ...] = self._check() if last or saving or evaluating else ()
             point = self._evaluate() if evaluating and not last else None
             events += self._restart_if_motion_is_missing()
             if saving and not last:
@@ -182,12 +184,12 @@ class TrainingRun:
             raise
         return self._save()
 
-    def _check(self) -> tuple[str, ...]:
+    def _check(self) -> tuple[Event, ...]:
         events = tuple(self._trainer.check())
-        self.log.note(self.iteration, events)
+        self.log.note(events)
         return events
 
-    def _restart_if_motion_is_missing(self) -> tuple[str, ...]:
+    def _restart_if_motion_is_missing(self) -> tuple[Event, ...]:
         """Once, after part of the steps: restart within a short part of the clip where a moving object is missing.
 
         Training does not find an object later that it has missed by then. The restart takes as many iterations as
@@ -209,11 +211,8 @@ class TrainingRun:
             return ()
         iteration = self.iteration
         self._start(RestartState(iteration, window))
-        events = (
-            f"restart: from the first anchors, in the middle {window:.0%} of the clip: in {share:.0%} of the views a "
-            "large moving object was missing. `time_window=1` keeps the model as it is.",
-        )
-        self.log.note(iteration, events)
+        events = (Restarted(iteration=iteration, missing_share=share, time_window=window),)
+        self.log.note(events)
         return events
 
     def _save(self, **how: bool) -> Path:
@@ -229,13 +228,13 @@ class TrainingRun:
         self.output.write_metrics(self._trainer, self.iteration, self.iterations, {})
         return point
 
-    def _finish(self) -> tuple[EvaluationPoint | None, tuple[str, ...]]:
+    def _finish(self) -> tuple[EvaluationPoint | None, tuple[Event, ...]]:
         """Evaluate all of val, write the last checkpoint, metrics and plots; returns the last point, and events."""
         trainer = self._trainer
         point, splits = self.output.evaluate_end(trainer, self.iteration)
         stiffness = self.output.stiffness(trainer)
-        events = stiffness.events()
-        self.log.note(self.iteration, events)
+        events = stiffness.events(self.iteration)
+        self.log.note(events)
         self._save(finished=True)
         compact = self.output.export(trainer)
         self.output.write_metrics(trainer, self.iteration, self.iterations, splits, compact, stiffness)
@@ -248,7 +247,7 @@ class TrainingRun:
         checkpoints are removed.
         """
         trainer = self._trainer
-        self.log.note(self.iteration, [f"diverged: {reason}"])
+        self.log.note([Diverged(iteration=self.iteration, reason=reason)])
         self.log.diverged = reason
         guard = trainer.guard
         trainer.restore()
@@ -269,7 +268,7 @@ class TrainingRun:
         if not self.metrics_path.exists():
             return False
         document = read_metrics(self.metrics_path)
-        return bool(document.get("iterations") == self.iterations and (document.get("splits") or not self.capture.val))
+        return document.iterations == self.iterations and bool(document.splits or not self.capture.val)
 
 
 @contextmanager

@@ -9,12 +9,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from graings.capture.capture import SPLITS, Frame
+from graings.capture.capture import SPLITS, Frame, Split
 from graings.capture.images import ImageStore
 from graings.errors import CheckpointError
 from graings.evaluation.evaluate import evaluate, subset
 from graings.evaluation.metrics import Lpips, SplitMetrics
 from graings.kernel import thread_count
+from graings.report.metrics_document import CompactFacts, EvaluationPoint
 from graings.storage.checkpoint import TrainingState, best_checkpoint, load_model, load_state, save_checkpoint
 from graings.storage.compact import read_compact, write_compact
 from graings.storage.run_folder import MODEL_FILE
@@ -23,7 +24,7 @@ from graings.training.guard.stiffness import Stiffness, subpixel_share
 from graings.training.held_out import HeldOut
 from graings.training.step_report import StepReport
 from graings.training.trainer import Trainer
-from graings.training.training_log import EvaluationPoint, TrainingLog
+from graings.training.training_log import TrainingLog
 
 LOG = logging.getLogger(__name__)
 
@@ -44,7 +45,7 @@ class RunOutput:
     folder: Path
     images: ImageStore
     log: TrainingLog
-    render_fps: float | None = None  # of the newest evaluation
+    render_fps: float | None = None  # of the newest evaluation; None before the first
 
     def held_out(self) -> tuple[Frame, ...]:
         """Validation views of the curve; never test views."""
@@ -62,7 +63,9 @@ class RunOutput:
         self.log.clock.add("evaluation", time.perf_counter() - started)
         return point
 
-    def evaluate_end(self, trainer: Trainer, iteration: int) -> tuple[EvaluationPoint | None, dict[str, Any]]:
+    def evaluate_end(
+        self, trainer: Trainer, iteration: int
+    ) -> tuple[EvaluationPoint | None, dict[Split, SplitMetrics]]:
         """Measure all validation views once: the last point of the curve, and the metrics of the split."""
         frames = self.log.capture.val
         started = time.perf_counter()
@@ -77,9 +80,9 @@ class RunOutput:
         of_curve = SplitMetrics.over([view for view in held_out.metrics.views if view.name in chosen])
         point = self._point(trainer, iteration, of_curve, held_out.subpixel_share)
         self.log.clock.add("evaluation", time.perf_counter() - started)
-        return point, {"val": held_out.metrics.to_json()}
+        return point, {"val": held_out.metrics}
 
-    def splits(self, trainer: Trainer) -> dict[str, Any]:
+    def splits(self, trainer: Trainer) -> dict[Split, SplitMetrics]:
         """Metrics of all validation views of the scene as it is, without a point of the curve."""
         if not self.log.capture.val:
             return {}
@@ -88,7 +91,7 @@ class RunOutput:
         held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background, Lpips.find())
         self.render_fps = held_out.frames_per_second
         self.log.clock.add("evaluation", time.perf_counter() - started)
-        return {"val": held_out.metrics.to_json()}
+        return {"val": held_out.metrics}
 
     def _point(self, trainer: Trainer, iteration: int, metrics: SplitMetrics, share: float | None) -> EvaluationPoint:
         stiffness = Stiffness(trainer.step_over_size, share, len(metrics.views))
@@ -136,7 +139,7 @@ class RunOutput:
         self.log.clock.add("checkpoint", time.perf_counter() - started)
         return path
 
-    def export(self, trainer: Trainer) -> dict[str, Any]:
+    def export(self, trainer: Trainer) -> CompactFacts:
         """Write the newest checkpoint as a compact file: its name, its bytes, and its PSNR over all of val."""
         started = time.perf_counter()
         size = write_compact(load_model(self.folder), self.folder / MODEL_FILE)
@@ -145,15 +148,15 @@ class RunOutput:
             scene = read_compact(self.folder / MODEL_FILE).scene
             psnr = evaluate(scene, self.log.capture.val, self.images, trainer.background).psnr
         self.log.clock.add("evaluation", time.perf_counter() - started)
-        return {"file": MODEL_FILE, "bytes": size, "psnr": psnr}
+        return CompactFacts(file=MODEL_FILE, bytes=size, psnr=psnr)
 
     def write_metrics(
         self,
         trainer: Trainer,
         iteration: int,
         planned: int,
-        splits: dict[str, Any],
-        compact: dict[str, Any] | None = None,
+        splits: dict[Split, SplitMetrics],
+        compact: CompactFacts | None = None,
         stiffness: Stiffness | None = None,
     ) -> None:
         """Write metrics.json, the curve and the report as of `iteration` of the `planned` ones."""

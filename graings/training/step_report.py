@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from graings.report.events import Event
+
 
 @dataclass(frozen=True, slots=True)
 class StepReport:
@@ -22,4 +24,4 @@ class StepReport:
     anchors: int
     seconds: float
     cpu_s: float
-    events: tuple[str, ...] = ()
+    events: tuple[Event, ...] = ()

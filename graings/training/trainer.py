@@ -19,6 +19,16 @@ from graings.camera.sampling_rate import SamplingRate
 from graings.capture.capture import Frame
 from graings.errors import DivergedError
 from graings.render import draw, low_pass
+from graings.report.events import (
+    BackgroundFound,
+    Event,
+    GradientsClipped,
+    LowResolutionStarted,
+    OpacityReset,
+    RolledBack,
+    StepSkipped,
+    TimeWindowStarted,
+)
 from graings.scene.scene import Composition, Scene
 from graings.training.guard.collapse import RESET_OPACITY, raise_opacity
 from graings.training.guard.guard import Gradient, Guard, StepCheck, first_not_finite
@@ -46,7 +56,7 @@ class Trainer(TrainerState):
         phase = self.phase(self.iteration)
         self.scene.temporal = phase.temporal
         self._set_sampling_rate(self.pyramid.at(self.iteration).sampling)
-        events = self._initial_events() if self.iteration == 1 else []
+        events: list[Event] = self._initial_events() if self.iteration == 1 else []
 
         # sample views
         frames = self.views.next(self.iteration)
@@ -80,15 +90,21 @@ class Trainer(TrainerState):
             self._measure_step(compositions[0], frames[0])
         else:
             self.optimizer.clear()
-            times = ", ".join(f"{frame.time:.4g}" for frame in frames)
-            events.append(f"skipped: {check.non_finite} was not finite on {_names(frames)} at t = {times}")
+            events.append(
+                StepSkipped(
+                    iteration=self.run_iteration,
+                    non_finite=check.non_finite,
+                    views=_names(frames),
+                    times=tuple(frame.time for frame in frames),
+                )
+            )
 
         # adapt the anchors, and check the health of the scene
         events += self._adapt()
         events += self._check_health(drawn, float(loss.photometric.detach().amax()))
         self._average()
         return StepReport(
-            iteration=self.iterations_before + self.iteration,
+            iteration=self.run_iteration,
             iterations=self.iterations_before + self.config.iterations,
             phase=phase.name,
             loss=float(loss.total.detach()),
@@ -100,16 +116,16 @@ class Trainer(TrainerState):
             events=tuple(events),
         )
 
-    def _initial_events(self) -> list[str]:
+    def _initial_events(self) -> list[Event]:
         """What was decided before the first step."""
-        events = list(self.notes)
+        iteration = self.run_iteration
+        events: list[Event] = [note.at(iteration) for note in self.notes]
         if self.background != (1.0, 1.0, 1.0):
-            color = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.background)
-            events.append(f"background: {color}; pixels of this colour count as background")
+            events.append(BackgroundFound(iteration=iteration, color=self.background))
         if (share := self.window.share(1)) < 1:
-            events.append(f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens")
+            events.append(TimeWindowStarted(iteration=iteration, share=share))
         if (factor := self.pyramid.at(1).factor) > 1:
-            events.append(f"low_resolution_until: begins with images of 1/{factor} of their width and height")
+            events.append(LowResolutionStarted(iteration=iteration, factor=factor))
         return events
 
     def _set_sampling_rate(self, sampling: SamplingRate) -> None:
@@ -117,10 +133,11 @@ class Trainer(TrainerState):
             self.scene.sampling = sampling
             self.guard.trend.begin()  # losses of another resolution do not compare
 
-    def _limit_gradients(self, check: StepCheck, frames: Sequence[Frame]) -> list[str]:
-        events = []
+    def _limit_gradients(self, check: StepCheck, frames: Sequence[Frame]) -> list[Event]:
+        events: list[Event] = []
         for group, (norm, limit) in check.limits.items():
-            events.append(f"clipped: gradients of {group} at {norm:.3g} limited to {limit:.3g} on {_names(frames)}")
+            iteration, views = self.run_iteration, _names(frames)
+            events.append(GradientsClipped(iteration=iteration, group=group, norm=norm, limit=limit, views=views))
             if group != SCREEN:
                 self.optimizer.limit(group, self.config.guard.clip, limit)
         return events
@@ -133,15 +150,15 @@ class Trainer(TrainerState):
             blur = low_pass(before, frame.camera)
             self.step_over_size = step_over_size(before.gaussians, after.gaussians, frame.camera, blur)
 
-    def _adapt(self) -> list[str]:
+    def _adapt(self) -> list[Event]:
         """Grow and prune anchors where the schedule says so; returns the events."""
-        events: list[str] = []
+        events: list[Event] = []
         if self.density.grows(self.iteration):
-            grown, events = self.density.grow(self.scene, self.optimizer, self.streams["growth"])
+            grown, events = self.density.grow(self.run_iteration, self.scene, self.optimizer, self.streams["growth"])
             if grown > 0:
                 self.guard.trend.grown()
         if self.density.prunes(self.iteration):
-            events += self.density.prune(self.scene, self.optimizer)
+            events += self.density.prune(self.run_iteration, self.scene, self.optimizer)
         return events
 
     def _average(self) -> None:
@@ -153,9 +170,9 @@ class Trainer(TrainerState):
             if self.iteration == self.config.iterations:
                 self.average.apply(self.scene)
 
-    def _check_health(self, drawn: int, difference: float) -> list[str]:
+    def _check_health(self, drawn: int, difference: float) -> list[Event]:
         """Detect a collapsed or diverged scene and roll back; take a snapshot of a healthy one. Returns the events."""
-        events: list[str] = []
+        events: list[Event] = []
         scaffold, config = self.scene.scaffold, self.config.guard
         problem = self.guard.problem()
         end_of_pass = not self.views.upcoming(self.iteration)
@@ -164,10 +181,7 @@ class Trainer(TrainerState):
             if problem is None and not self.collapse.raised:
                 shift = raise_opacity(self.scene)
                 self.collapse.raised = True
-                events.append(
-                    f"opacity_rebias: no Gaussian was drawn any more; opacities raised to {RESET_OPACITY} "
-                    f"({shift:+.3g}). Where motion is large, train with a smaller `time_window`."
-                )
+                events.append(OpacityReset(iteration=self.run_iteration, opacity=RESET_OPACITY, shift=shift))
             elif problem is None and self.collapse.missed:  # where the images are empty, the scene may be too
                 problem = "no Gaussian was drawn any more, though the images are not empty"
         snapshot_due = self.iteration % config.snapshot_every == 0
@@ -179,7 +193,7 @@ class Trainer(TrainerState):
             self._take_snapshot()
         return events
 
-    def check(self) -> list[str]:
+    def check(self) -> list[Event]:
         """Make sure that the scene is finite before it is rendered or saved; rolls back where it is not.
 
         Returns the events. Raises `DivergedError` as `step` does.
@@ -196,11 +210,11 @@ class Trainer(TrainerState):
     def _take_snapshot(self) -> None:
         self.snapshots.take(self.iteration, self.scene, *self.state())
 
-    def _roll_back(self, problem: str) -> str:
+    def _roll_back(self, problem: str) -> RolledBack:
         """Restore a snapshot and continue with lower rates and another order of views. The iterations are spent."""
         if self.guard.rollbacks >= self.config.guard.rollbacks:
             raise DivergedError(
-                f"Training diverged at iteration {self.iterations_before + self.iteration} after "
+                f"Training diverged at iteration {self.run_iteration} after "
                 f"{self.guard.rollbacks} rollbacks: {problem}. The best model is kept. "
                 "Train again with smaller rates (`rates`)."
             )
@@ -214,9 +228,11 @@ class Trainer(TrainerState):
         self.collapse.raised = raised
         self._slow_down()
         self._restart_views()
-        return (
-            f"rolled back to iteration {self.iterations_before + snapshot.iteration}: {problem}; "
-            f"rates at {self.optimizer.damping:.3g} of their plan from here on"
+        return RolledBack(
+            iteration=self.run_iteration,
+            to_iteration=self.iterations_before + snapshot.iteration,
+            reason=problem,
+            rate_factor=self.optimizer.damping,
         )
 
     def restore(self) -> None:
@@ -232,5 +248,5 @@ class Trainer(TrainerState):
         self._restart_views()
 
 
-def _names(frames: Sequence[Frame]) -> str:
-    return ", ".join(frame.name for frame in frames)
+def _names(frames: Sequence[Frame]) -> tuple[str, ...]:
+    return tuple(frame.name for frame in frames)

@@ -12,6 +12,7 @@ from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.config.schedule import Phase, phases
 from graings.random import RandomStreams
+from graings.report.events import PointsInitialized
 from graings.scene.scene import Scene
 from graings.training.curriculum.image_pyramid import ImagePyramid
 from graings.training.curriculum.time_window import TimeWindow
@@ -51,7 +52,7 @@ class TrainerState:
         streams: RandomStreams,
         voxel_size: float,
         time_window: float,
-        notes: Sequence[str] = (),
+        notes: Sequence[PointsInitialized] = (),
         iterations_before: int = 0,
     ) -> None:
         self.capture = capture
@@ -107,7 +108,7 @@ class TrainerState:
             streams=RandomStreams(config.seed),
             voxel_size=float(facts["voxel_size"]),
             time_window=float(facts["time_window"]),
-            notes=facts["notes"],
+            notes=[PointsInitialized.model_validate(note) for note in facts["notes"]],
             iterations_before=iterations_before,
         )
         trainer.load(scene, tensors, facts)
@@ -132,6 +133,11 @@ class TrainerState:
         stream = self.streams[f"sampler.{attempt}" if attempt else "sampler"]
         sampler = ViewSampler(len(self.capture.train), stream)
         self.views = ViewBatches(self.config.batch, self.window, self.pyramid, sampler)
+
+    @property
+    def run_iteration(self) -> int:
+        """Iterations of the run done, those before a restart included."""
+        return self.iterations_before + self.iteration
 
     def phase(self, iteration: int) -> Phase:
         """The phase that `iteration` (from 1) belongs to."""
@@ -158,7 +164,7 @@ class TrainerState:
         facts = {
             "iteration": self.iteration,
             "time_window": self.window.first,
-            "notes": list(self.notes),
+            "notes": [note.model_dump(mode="json") for note in self.notes],
             **density,
             "guard": guard,
             "collapse": self.collapse.state(),

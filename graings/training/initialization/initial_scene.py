@@ -20,6 +20,7 @@ from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.random import RandomStreams
+from graings.report.events import PointsInitialized
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.training.curriculum.time_window import TimeWindow
@@ -60,7 +61,7 @@ class InitialScene:
     scene: Scene
     voxel_size: float  # normalised units
     time_window: float  # share of the clip that training begins with
-    notes: tuple[str, ...]  # how the points were chosen, where masks did not
+    notes: tuple[PointsInitialized, ...]  # how the points were chosen, where masks did not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +70,7 @@ class InitialPoints:
 
     positions: NDArray[np.float64]
     time_window: float
-    notes: tuple[str, ...] = ()
+    notes: tuple[PointsInitialized, ...] = ()
 
 
 def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: RandomStreams) -> InitialScene:
@@ -124,29 +125,27 @@ def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, st
     order = torch.randperm(len(capture.train), generator=generator).tolist()
     whole = _masked_views(capture, images, config, order, 1.0)
     check_not_empty(whole)  # within a part of the clip all objects may be out of view
-    notes: tuple[str, ...] = ()
+    notes: tuple[PointsInitialized, ...] = ()
     if np.mean([view.mask.mean() for view in whole]) > FILLED:
-        places, notes = _triangulated(capture, images)
+        places, note = _triangulated(capture, images)
+        notes = (note,)
         if places is not None:
             return InitialPoints(_subsampled(places, surface_limit, generator), window, notes)
     inside, window = _within_hull(cube, order, whole, capture, images, config) or (cube, window)
     return InitialPoints(_subsampled(inside, most, generator), window, notes)
 
 
-def _triangulated(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """Points [M, 3] triangulated from pairs of images, None where there are too few; and how points were chosen."""
+def _triangulated(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, PointsInitialized]:
+    """Points [M, 3] triangulated from pairs of images, None where there are too few; and the event for the report."""
     try:
         found = triangulate(capture.train, images)
     except ImportError:
-        hint = "pip install graings[colmap] to triangulate them from the images"
-        return None, (f"initial points: random, as there is neither a mask nor a point cloud; {hint}",)
+        return None, PointsInitialized(iteration=0, source="random", triangulated=None)
     count = len(found.points)
     if count < MIN_POINTS:
-        return None, (f"initial points: random, as only {count} could be triangulated",)
-    note = (
-        f"initial points: {count:,} triangulated from pairs of images, {len(found.filled):,} interpolated between them"
-    )
-    return np.concatenate([found.points, found.filled]), (note,)
+        return None, PointsInitialized(iteration=0, source="random", triangulated=count)
+    event = PointsInitialized(iteration=0, source="triangulation", triangulated=count, interpolated=len(found.filled))
+    return np.concatenate([found.points, found.filled]), event
 
 
 def _masked_views(
