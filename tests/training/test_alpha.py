@@ -1,4 +1,4 @@
-"""Where pictures have an alpha channel, what is opaque becomes so even in the background's colour."""
+"""Training with the alpha loss: objects of the background colour become opaque."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def on_white_and_black(capture: Path, **options: object) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def test_what_is_white_on_white_is_drawn_on_black_too(tmp_path: Path) -> None:
+def test_a_white_object_on_white_is_opaque_on_black(tmp_path: Path) -> None:
     """With a weight that wins against the first colours, which are wrong: what they make faint nothing brings back."""
     white, black = on_white_and_black(tmp_path / "with", **{"loss.alpha": 3.0})
     white_without, black_without = on_white_and_black(tmp_path / "without", **{"loss.alpha": 0.0})
@@ -58,7 +58,7 @@ def test_what_is_white_on_white_is_drawn_on_black_too(tmp_path: Path) -> None:
     assert black_without < 10  # the white half is missing
 
 
-def test_a_step_weighs_the_difference_in_alpha(tmp_path: Path) -> None:
+def test_the_alpha_loss_changes_the_gradient_of_a_step(tmp_path: Path) -> None:
     capture = snowman(tmp_path / "c")
     without, weighed = (micro_trainer(capture, **{"loss.alpha": weight}) for weight in (0.0, 0.5))
     frame = weighed.capture.train[0]
@@ -73,7 +73,7 @@ def test_a_step_weighs_the_difference_in_alpha(tmp_path: Path) -> None:
     assert steps(weighed, 1)[0].loss - steps(without, 1)[0].loss == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_capture_without_alpha_does_without(tmp_path: Path) -> None:
+def test_a_capture_without_alpha_has_no_alpha_loss(tmp_path: Path) -> None:
     config = make_config("draft")
     for alpha, decision in ((True, "keep"), (False, "drop")):
         capture = load_capture(snowman(tmp_path / f"{alpha}", alpha=alpha), config.capture)

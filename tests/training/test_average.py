@@ -38,7 +38,7 @@ def test_training_ends_with_the_mean_of_its_last_steps(micro: Path) -> None:
     assert float(moved.abs().max()) > 1e-4
 
 
-def test_it_is_the_same_after_an_interruption_among_them(micro: Path) -> None:
+def test_an_interruption_while_averaging_changes_nothing(micro: Path) -> None:
     whole = micro_trainer(micro, **HALF)
     steps(whole, 40)
     first = micro_trainer(micro, **HALF)
@@ -51,12 +51,12 @@ def test_it_is_the_same_after_an_interruption_among_them(micro: Path) -> None:
 
 
 @pytest.mark.parametrize("mark", ["density.grow_until", "density.prune_until"])
-def test_nothing_is_averaged_while_anchors_may_come_or_go(micro: Path, mark: str) -> None:
+def test_nothing_is_averaged_while_anchors_may_be_added_or_removed(micro: Path, mark: str) -> None:
     trainer = micro_trainer(micro, **HALF | {mark: 30_000})
     steps(trainer, 40)
     assert trainer.average.steps == 0
 
 
-def test_a_mean_of_nothing_is_refused() -> None:
+def test_applying_an_empty_average_is_refused() -> None:
     with pytest.raises(ValueError, match="no step was added"):
         ParameterAverage().apply(tiny_scene())

@@ -32,7 +32,7 @@ def watched(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[list[str]
 
 
 @pytest.mark.parametrize("batch", [1, 2, 4, 50])
-def test_a_pass_shows_every_view_once_and_no_step_reaches_into_the_next(
+def test_a_pass_uses_every_view_once_and_no_step_spans_two_passes(
     micro: Path, monkeypatch: pytest.MonkeyPatch, batch: int
 ) -> None:
     trainer = micro_trainer(micro, batch=batch, time_window=1)
@@ -48,14 +48,14 @@ def test_a_pass_shows_every_view_once_and_no_step_reaches_into_the_next(
         assert max(sizes) - min(sizes) <= 1
 
 
-def test_rates_are_those_of_the_views_a_step_can_have(micro: Path) -> None:
+def test_learning_rates_depend_on_the_views_per_step(micro: Path) -> None:
     few, some = micro_trainer(micro, batch=50), micro_trainer(micro, batch=2)
     views = len(few.capture.train)
     ratio = few.optimizer.rate("offsets", 1) / some.optimizer.rate("offsets", 1)
     assert ratio == pytest.approx((views / 2) ** (1 / 3))
 
 
-def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_descends_the_mean_loss_of_its_views(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = micro_trainer(
         micro, batch=3, warmup=0, **{f"loss.{name}": 0 for name in ("temporal", "deformation", "residual", "rigidity")}
     )
@@ -89,7 +89,7 @@ def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.Monkey
             assert float(difference) <= 1e-4 * float(parameter.grad.norm()), name
 
 
-def test_it_is_the_same_after_an_interruption(micro: Path) -> None:
+def test_an_interrupted_training_equals_the_unbroken_one(micro: Path) -> None:
     options = {"iterations": 40, "batch": 4}
     whole, first, second = (micro_trainer(micro, **options) for _ in range(3))
     steps(whole, 20)
@@ -100,7 +100,7 @@ def test_it_is_the_same_after_an_interruption(micro: Path) -> None:
     assert all(torch.equal(one, other) for one, other in pairs)
 
 
-def test_it_learns(micro: Path) -> None:
+def test_training_with_several_views_per_step_improves_quality(micro: Path) -> None:
     trainer = micro_trainer(micro, iterations=60, batch=3)
     before = quality(trainer)
     steps(trainer, 60)

@@ -43,7 +43,7 @@ def test_gradients_are_counted_in_ndc_units_and_only_for_visible_children() -> N
     assert statistics.opacity.tolist() == [0.75, 0.0]
 
 
-def test_an_anchor_with_no_visible_opacity_counts_as_seen() -> None:
+def test_an_anchor_with_no_visible_opacity_counts_as_visited() -> None:
     statistics = DensityStatistics(1, 2)
     nothing = torch.zeros(0, dtype=torch.int64)
     statistics.observe(
@@ -52,7 +52,7 @@ def test_an_anchor_with_no_visible_opacity_counts_as_seen() -> None:
     assert statistics.visits.tolist() == [1]
 
 
-def test_children_seen_too_rarely_or_moving_too_little_do_not_grow() -> None:
+def test_children_observed_too_rarely_or_with_small_gradients_do_not_grow() -> None:
     scaffold = tiny_scene().scaffold
     assert len(_grow(scaffold, _busy(scaffold, times=40))) == 0
     assert len(_grow(scaffold, _busy(scaffold, gradient=1.9e-4))) == 0
@@ -86,7 +86,7 @@ def test_growing_twice_from_the_same_statistics_adds_nothing_in_the_same_cells()
     assert not before & {tuple(key) for key in voxel_keys(second.rows["anchors"], VOXEL).tolist()}
 
 
-def test_finer_levels_ask_for_larger_gradients() -> None:
+def test_finer_levels_need_larger_gradients() -> None:
     scaffold, least = tiny_scene(anchors=200).scaffold, DensityConfig().gradient_threshold
     coarse = _grow(scaffold, _busy(scaffold, gradient=1.5 * least), levels=2).rows["log_scales"].unique()
     both = _grow(scaffold, _busy(scaffold, gradient=2.5 * least), levels=2).rows["log_scales"].unique()
@@ -107,7 +107,7 @@ def test_the_budget_keeps_the_largest_gradients() -> None:
     assert torch.allclose(mean, scaffold.anchors[-20:].mean(0), atol=0.3)
 
 
-def test_thinning_keeps_what_asks_for_more_and_widens_the_rest() -> None:
+def test_thinning_keeps_the_largest_gradients_and_enlarges_the_rest() -> None:
     scaffold = tiny_scene(anchors=200).scaffold
     statistics = _busy(scaffold, gradient=0.1)
     asking = torch.tensor([3, 50, 170, 199])
@@ -126,7 +126,7 @@ def test_thinning_keeps_what_asks_for_more_and_widens_the_rest() -> None:
     assert torch.equal(keep, again[0])
 
 
-def test_newborns_are_faint_or_inherit_when_asked() -> None:
+def test_new_anchors_are_faint_or_inherit_their_opacity_as_configured() -> None:
     scaffold = tiny_scene().scaffold
     logits = torch.full((scaffold.count, 3), 1.0)
     parents = torch.tensor([0, 5])
@@ -155,7 +155,7 @@ def test_pruning_never_empties_the_scene() -> None:
     assert bool(prune(scaffold, statistics, DensityConfig()).all())
 
 
-def test_an_anchor_that_showed_much_and_fades_is_pruned_at_the_second_look() -> None:
+def test_an_anchor_that_has_faded_is_pruned_at_the_second_pruning() -> None:
     scene = tiny_scene()
     config = TrainConfig()
     control = DensityControl(config, scene, VOXEL)

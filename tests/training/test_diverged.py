@@ -19,13 +19,13 @@ from graings.storage.run_folder import checkpoints
 from graings.training.run import TrainingRun
 from tests.training.micro import micro_config, spoil_loss
 
-LOST_AT = 70
+DIVERGES_AT = 70
 
 
-def _lost(micro: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, **options: object) -> TrainingRun:
-    """A run that is spoiled for good from step `LOST_AT` on."""
+def _diverged_run(micro: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, **options: object) -> TrainingRun:
+    """A run that is spoiled for good from step `DIVERGES_AT` on."""
     run = TrainingRun.create(micro, folder, micro_config(**{"evaluation.checkpoint_every": 30} | options))
-    spoil_loss(monkeypatch, run._trainer, lambda i: i >= LOST_AT)
+    spoil_loss(monkeypatch, run._trainer, lambda i: i >= DIVERGES_AT)
     with pytest.raises(DivergedError, match="The best model is kept"):
         list(run)
     return run
@@ -39,15 +39,15 @@ def _document(folder: Path) -> dict[str, Any]:
     return document
 
 
-def test_a_run_that_diverges_delivers_its_best_model_and_says_so(
+def test_a_diverged_run_keeps_its_best_model_and_reports_the_reason(
     micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "run"
-    run = _lost(micro, folder, monkeypatch)
+    run = _diverged_run(micro, folder, monkeypatch)
     model, document = load_model(folder), _document(folder)
     assert (document["diverged"], document["rollbacks"]) == (True, 3)
     assert "3 times: the loss was not finite" in document["diverged_reason"]
-    assert document["iterations"] == model.iteration == run.iteration < LOST_AT
+    assert document["iterations"] == model.iteration == run.iteration < DIVERGES_AT
     assert not model.finished
     assert all(bool(values.isfinite().all()) for values in model.scene.state_dict().values())
     view = model.views["val"][0]
@@ -63,12 +63,12 @@ def test_a_run_that_diverges_delivers_its_best_model_and_says_so(
     assert sum(event["kind"] == "skipped" for event in events) >= 9
 
 
-def test_the_best_evaluation_is_delivered_where_the_last_good_moment_was_worse(
+def test_the_best_evaluation_wins_over_a_worse_snapshot(
     micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "run"
     run = TrainingRun.create(micro, folder, micro_config(**{"guard.rollbacks": 0}))
-    spoil_loss(monkeypatch, run._trainer, lambda i: i >= LOST_AT)
+    spoil_loss(monkeypatch, run._trainer, lambda i: i >= DIVERGES_AT)
     steps = iter(run)
     for report in steps:
         if report.iteration == 46:
@@ -83,20 +83,20 @@ def test_the_best_evaluation_is_delivered_where_the_last_good_moment_was_worse(
     assert _document(folder)["splits"]["val"]["psnr"] == pytest.approx(run._best_psnr, abs=1.0)
 
 
-def test_a_run_that_diverges_before_anything_was_measured_delivers_its_beginning(
+def test_a_run_that_diverges_before_any_evaluation_keeps_its_initial_scene(
     micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tests.training.test_diverged.LOST_AT", 1)
-    _lost(micro, tmp_path / "run", monkeypatch)
+    monkeypatch.setattr("tests.training.test_diverged.DIVERGES_AT", 1)
+    _diverged_run(micro, tmp_path / "run", monkeypatch)
     assert load_model(tmp_path / "run").iteration == 0
     assert _document(tmp_path / "run")["diverged"]
 
 
-def test_a_diverged_run_can_be_resumed_at_its_low_rates_and_finish(
+def test_a_diverged_run_can_be_resumed_at_its_low_rates_and_finishes(
     micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "run"
-    _lost(micro, folder, monkeypatch, iterations=90)
+    _diverged_run(micro, folder, monkeypatch, iterations=90)
     monkeypatch.undo()
     again = TrainingRun.resume(folder, threads=1)
     assert again._trainer.optimizer.damping == 0.125

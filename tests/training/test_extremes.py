@@ -55,7 +55,7 @@ def _painted(
 
 
 @pytest.mark.parametrize("factor", [1e-4, 1e5])
-def test_a_tiny_or_huge_world_trains_as_well_as_any(micro: Path, tmp_path: Path, factor: float) -> None:
+def test_tiny_and_huge_scenes_train_as_well_as_others(micro: Path, tmp_path: Path, factor: float) -> None:
     """D09: 300 iterations; units of length are a power of two times normalised ones, so rounding differs."""
     qualities = []
     for capture in (micro, _scaled(micro, tmp_path / "scaled", factor)):
@@ -69,7 +69,7 @@ def test_a_tiny_or_huge_world_trains_as_well_as_any(micro: Path, tmp_path: Path,
 
 
 @pytest.mark.parametrize("exponent", [-13, 17])
-def test_a_world_scaled_by_a_power_of_two_trains_to_the_same_bits(micro: Path, tmp_path: Path, exponent: int) -> None:
+def test_a_scene_scaled_by_a_power_of_two_trains_to_the_same_bits(micro: Path, tmp_path: Path, exponent: int) -> None:
     """D09, exact: between 1e-4 and 1e5 times the size."""
     trainers = [micro_trainer(c) for c in (micro, _scaled(micro, tmp_path / "scaled", 2.0**exponent))]
     reports = [steps(trainer, 30) for trainer in trainers]

@@ -37,11 +37,11 @@ def test_one_bad_entry_of_a_gradient_is_named(bad: float) -> None:
     assert guard.skipped == 2
 
 
-def test_a_gradient_whose_square_overflows_is_large_and_not_wrong() -> None:
+def test_a_gradient_whose_square_overflows_counts_as_large_not_as_infinite() -> None:
     assert Guard(GuardConfig()).check_step(1, ONE, _gradient(torch.full((100,), 1e30))).non_finite is None
 
 
-def test_a_group_far_above_its_median_is_limited_and_the_others_are_not() -> None:
+def test_a_group_far_above_its_median_norm_is_clipped_and_the_others_are_not() -> None:
     guard = _settled()
     usual = Gradient("q", "h", torch.ones(1))
     verdict = guard.check_step(WINDOW, ONE, [*_gradient(torch.tensor([300.0, 400.0])), usual])
@@ -50,20 +50,20 @@ def test_a_group_far_above_its_median_is_limited_and_the_others_are_not() -> Non
     assert not guard.check_step(WINDOW + 1, ONE, _gradient(torch.tensor([60.0, 79.0]))).limits
 
 
-def test_nothing_is_limited_before_the_usual_size_is_known() -> None:
+def test_nothing_is_clipped_before_the_usual_norm_is_known() -> None:
     guard = Guard(GuardConfig())
     for iteration in range(FEWEST):
         assert not guard.check_step(iteration, ONE, _gradient(torch.tensor([10.0**iteration]))).limits
 
 
-def test_a_lasting_change_of_size_becomes_the_usual_size() -> None:
+def test_a_permanent_change_of_the_norm_becomes_the_usual_norm() -> None:
     guard = _settled()
     limited = [bool(guard.check_step(i, ONE, _gradient(torch.tensor([1e3]))).limits) for i in range(2 * WINDOW)]
     assert limited[0]
     assert not limited[-1]
 
 
-def test_three_bad_steps_in_a_row_are_a_problem_and_a_good_one_forgives() -> None:
+def test_three_skipped_steps_in_a_row_are_a_problem_and_a_good_one_resets_the_count() -> None:
     guard = Guard(GuardConfig())
     for iteration, loss in enumerate((NAN, NAN, ONE, NAN, NAN)):
         guard.check_step(iteration, loss, [])
@@ -72,7 +72,7 @@ def test_three_bad_steps_in_a_row_are_a_problem_and_a_good_one_forgives() -> Non
     assert guard.problem() == "the loss was not finite in 3 steps in a row"
 
 
-def test_ten_bad_steps_among_a_thousand_are_a_problem_and_old_ones_are_forgotten() -> None:
+def test_ten_skipped_steps_among_a_thousand_are_a_problem_and_older_ones_do_not_count() -> None:
     often, rarely = Guard(GuardConfig()), Guard(GuardConfig())
     for number in range(MAX_RECENT_SKIPS):
         for guard, apart in ((often, 50), (rarely, MEMORY // MAX_RECENT_SKIPS + 12)):
@@ -83,7 +83,7 @@ def test_ten_bad_steps_among_a_thousand_are_a_problem_and_old_ones_are_forgotten
     assert rarely.problem() is None
 
 
-def test_a_guard_continues_from_its_state_with_the_same_verdicts() -> None:
+def test_a_guard_continues_from_its_state_with_the_same_results() -> None:
     one = _settled()
     one.check_step(WINDOW, NAN, [])
     other = Guard(GuardConfig())
@@ -93,7 +93,7 @@ def test_a_guard_continues_from_its_state_with_the_same_verdicts() -> None:
     assert other.check_step(WINDOW + 1, ONE, large) == one.check_step(WINDOW + 1, ONE, large)
 
 
-def test_after_going_back_counts_stay_and_the_reasons_to_go_back_are_gone() -> None:
+def test_a_rollback_keeps_the_counts_and_clears_the_problem() -> None:
     before = Guard(GuardConfig())
     for iteration in range(3):
         before.check_step(iteration, NAN, [])
@@ -125,7 +125,7 @@ def test_a_loss_that_stays_far_above_its_best_is_divergence() -> None:
 
 
 @pytest.mark.parametrize(("best", "later"), [(0.001, 0.015), (0.1, 0.19)])
-def test_a_loss_that_doubles_unseen_or_not_quite_is_no_divergence(best: float, later: float) -> None:
+def test_a_small_loss_that_doubles_is_no_divergence(best: float, later: float) -> None:
     trend = LossTrend(GuardConfig(patience=10))
     _losses(trend, (best, 300), (later, 1000))
     assert trend.problem() is None
@@ -138,7 +138,7 @@ def test_a_single_outlier_is_no_divergence() -> None:
     assert trend.problem() is None
 
 
-def test_an_easy_view_at_the_start_is_not_the_best_that_a_run_has_been() -> None:
+def test_an_easy_first_view_does_not_set_the_best_loss() -> None:
     trend = LossTrend(GuardConfig(patience=10))
     _losses(trend, (0.01, 1), (0.3, 300))
     assert trend.problem() is None
@@ -154,7 +154,7 @@ def test_steps_right_after_a_growth_do_not_count_as_divergence() -> None:
     assert trend.problem() is not None
 
 
-def test_a_trend_continues_from_its_state() -> None:
+def test_a_loss_trend_continues_from_its_state() -> None:
     one, other = LossTrend(GuardConfig()), LossTrend(GuardConfig())
     _losses(one, (0.1, 50), (0.7, 20))
     other.load(one.state())

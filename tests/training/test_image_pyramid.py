@@ -1,4 +1,4 @@
-"""A training that begins with small pictures."""
+"""Training that begins with downscaled images."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ def _camera(width: int, height: int) -> Camera:
         ([(399, 399)], [1, 1, 1, 1, 1, 1]),
     ],
 )
-def test_sides_double_at_even_distances(sizes: list[tuple[int, int]], expected: list[int]) -> None:
+def test_the_resolution_doubles_at_even_intervals(sizes: list[tuple[int, int]], expected: list[int]) -> None:
     config = make_config("standard", {"iterations": 3_000, "low_resolution_until": 12_000})
     cameras = [_camera(*size) for size in sizes]
     assert [downscale_factor(config, cameras, iteration) for iteration in (0, 1, 601, 1_200, 1_201, 3_000)] == expected
 
 
 @pytest.mark.parametrize("options", [{"low_resolution_until": 0}, {"low_resolution_until": 1, "iterations": 1}])
-def test_without_a_step_for_them_no_picture_is_small(options: dict[str, int]) -> None:
+def test_without_the_option_no_image_is_downscaled(options: dict[str, int]) -> None:
     config = make_config("standard", options)
     assert [downscale_factor(config, [_camera(800, 800)], iteration) for iteration in (0, 1)] == [1, 1]
 
 
-def test_a_smaller_picture_shows_the_same_view() -> None:
+def test_a_downscaled_camera_has_the_same_field_of_view() -> None:
     camera = _camera(401, 301)
     small = downscaled(camera, 2)
     assert (small.width, small.height) == (201, 151)
@@ -56,7 +56,7 @@ def test_a_smaller_picture_shows_the_same_view() -> None:
 
 @pytest.fixture
 def begins_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The micro capture's pictures are small enough for a test as they are."""
+    """The images of the micro capture are small already: let them be downscaled further."""
     monkeypatch.setattr(resolution, "SMALLEST", 4)
 
 
@@ -65,7 +65,7 @@ def _trainer(micro: Path, **options: object) -> Trainer:
 
 
 @pytest.mark.usefixtures("begins_small")
-def test_steps_see_small_pictures_first_and_then_the_photographs(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_use_downscaled_images_first_and_full_ones_later(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = _trainer(micro)
     side = trainer.capture.train[0].camera.width
     drawn: list[tuple[int, int]] = []
@@ -86,7 +86,7 @@ def test_steps_see_small_pictures_first_and_then_the_photographs(micro: Path, mo
 
 
 @pytest.mark.usefixtures("begins_small")
-def test_a_small_picture_is_the_mean_of_what_its_pixels_cover(micro: Path) -> None:
+def test_a_downscaled_image_is_an_area_average(micro: Path) -> None:
     trainer = _trainer(micro)
     level = trainer.pyramid.at(20)
     whole, small = trainer.images.rgb(trainer.capture.train[0]), trainer.images.rgb(level.frames[0])
@@ -95,7 +95,7 @@ def test_a_small_picture_is_the_mean_of_what_its_pixels_cover(micro: Path) -> No
 
 
 @pytest.mark.usefixtures("begins_small")
-def test_the_low_pass_is_that_of_the_pictures_looked_at(micro: Path, tmp_path: Path) -> None:
+def test_the_low_pass_follows_the_resolution_of_the_step(micro: Path, tmp_path: Path) -> None:
     run = TrainingRun.create(micro, tmp_path / "run", micro_config(iterations=40, low_resolution_until=15_000))
     references = {}
     for report in run:
@@ -111,7 +111,7 @@ def test_the_low_pass_is_that_of_the_pictures_looked_at(micro: Path, tmp_path: P
 
 @pytest.mark.usefixtures("begins_small")
 @pytest.mark.parametrize("stop", [9, 20, 21])
-def test_it_is_the_same_after_an_interruption(micro: Path, stop: int) -> None:
+def test_an_interrupted_training_equals_the_unbroken_one(micro: Path, stop: int) -> None:
     whole, first, second = (_trainer(micro) for _ in range(3))
     steps(whole, 30)
     steps(first, stop)
@@ -123,7 +123,7 @@ def test_it_is_the_same_after_an_interruption(micro: Path, stop: int) -> None:
 
 
 @pytest.mark.usefixtures("begins_small")
-def test_losses_of_small_pictures_are_no_measure_for_those_of_large_ones(micro: Path) -> None:
+def test_the_loss_trend_restarts_when_the_resolution_changes(micro: Path) -> None:
     trainer = _trainer(micro)
     steps(trainer, 20)
     trainer.guard.trend.best = 1e-9  # whatever comes is far above it
@@ -132,7 +132,7 @@ def test_losses_of_small_pictures_are_no_measure_for_those_of_large_ones(micro: 
 
 
 @pytest.mark.usefixtures("begins_small")
-def test_going_back_to_small_pictures_brings_neither_their_losses_nor_their_low_pass(micro: Path) -> None:
+def test_a_rollback_to_a_lower_resolution_restores_neither_its_losses_nor_its_low_pass(micro: Path) -> None:
     trainer = _trainer(micro, **{"guard.snapshot_every": 15})
     steps(trainer, 22)
     assert trainer.snapshots.newest.scene.sampling == trainer.pyramid.at(15).sampling

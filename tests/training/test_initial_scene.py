@@ -1,4 +1,4 @@
-"""What training starts with: cells as fine as near views ask for; what pictures agree on where they are filled."""
+"""The initial scene: voxel size, and triangulated points where the masks cover the images."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def _magnified(frame: Frame, times: float) -> Frame:
     return replace(frame, camera=replace(camera, fx=times * camera.fx, fy=times * camera.fy))
 
 
-def test_the_finest_cell_is_a_share_of_a_pixel_at_the_centre(capture: Capture) -> None:
+def test_the_voxel_size_is_a_share_of_a_pixel_at_the_centre(capture: Capture) -> None:
     camera = capture.train[0].camera
     pixel = float((camera.center**2).sum() ** 0.5) / camera.fx
     assert _start(capture).voxel_size == pytest.approx(VOXEL_PER_PIXEL * pixel, rel=1e-6)
 
 
-def test_the_finest_cell_follows_the_near_views_and_not_a_single_one(capture: Capture) -> None:
+def test_the_voxel_size_follows_the_near_views_but_not_a_single_close_up(capture: Capture) -> None:
     usual = _start(capture).voxel_size
     for count, share in ((1, 1.0), (7, 1 / 3)):
         frames = [_magnified(frame, 3.0 if i < count else 1.0) for i, frame in enumerate(capture.train)]
@@ -61,7 +61,7 @@ def test_the_finest_cell_follows_the_near_views_and_not_a_single_one(capture: Ca
         assert _start(mixed).voxel_size == pytest.approx(share * usual, rel=1e-6)
 
 
-def test_a_camera_amid_the_content_does_not_ask_for_ever_finer_cells(capture: Capture) -> None:
+def test_a_camera_inside_the_content_does_not_shrink_the_voxels_without_bound(capture: Capture) -> None:
     frames = []
     for frame in capture.train:
         pose = frame.camera.world_to_camera.copy()
@@ -73,7 +73,7 @@ def test_a_camera_amid_the_content_does_not_ask_for_ever_finer_cells(capture: Ca
     )
 
 
-def test_a_configured_cell_is_taken_as_it_is(capture: Capture) -> None:
+def test_a_configured_voxel_size_is_used_unchanged(capture: Capture) -> None:
     assert _start(capture, **{"init.voxel_size": 0.0625}).voxel_size == 0.0625
 
 
@@ -88,54 +88,53 @@ def _first(capture: Capture, **options: object) -> InitialPoints:
     return initial_points(capture, ImageStore(WHITE), make_config("draft", options), RandomStreams(0))
 
 
-def test_filled_pictures_begin_with_what_pairs_of_them_agree_on(filled: Capture) -> None:
+def test_images_without_background_begin_with_triangulated_points(filled: Capture) -> None:
     found = triangulate(filled.train, ImageStore(WHITE))
-    agreed = np.concatenate([found.points, found.filled])
+    expected = np.concatenate([found.points, found.filled])
     first = _first(filled)
-    np.testing.assert_array_equal(first.positions, agreed)
-    counts = len(found.points), len(found.filled)
-    assert first.notes == (
-        f"first points: {counts[0]:,} places that pairs of pictures agree on, and {counts[1]:,} between them",
-    )
+    np.testing.assert_array_equal(first.positions, expected)
+    (event,) = first.notes
+    assert (event.source, event.triangulated) == ("triangulation", len(found.points))
+    assert event.interpolated == len(found.filled)
     for option in ("init.max_points", "density.max_anchors"):
         few = _first(filled, **{option: 100}).positions
         assert len(few) == 100
-        assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in agreed.tolist()}
+        assert {tuple(place) for place in few.tolist()} < {tuple(place) for place in expected.tolist()}
 
 
-def test_cameras_that_look_outwards_are_filled_though_most_of_the_cube_is_behind_them(tmp_path: Path) -> None:
+def test_cameras_that_look_outwards_get_triangulated_points(tmp_path: Path) -> None:
     cameras = []
     for angle in np.radians(np.arange(0.0, 360.0, 15.0)):
         x, y = math.cos(angle), math.sin(angle)
         cameras.append(Camera.look_at((x, y, 2.0), (3 * x, 3 * y, 0.0), fov=FOV, width=64, height=64))
     capture = load_capture(write_walled(tmp_path, cameras))
     assert any("look outwards" in note for note in capture.notes)
-    assert _first(capture).notes[0].endswith(" between them")
+    assert [event.source for event in _first(capture).notes] == ["triangulation"]
 
 
-def test_who_wants_random_points_gets_them(filled: Capture) -> None:
+def test_random_points_can_be_requested(filled: Capture) -> None:
     first = _first(filled, **{"init.min_mask_fraction": 0.0, "init.points": 1_000})
     assert (len(first.positions), first.notes) == (1_000, ())
 
 
-def test_filled_pictures_that_agree_on_too_little_begin_with_random_points(tmp_path: Path) -> None:
+def test_too_few_triangulated_points_fall_back_to_random_ones(tmp_path: Path) -> None:
     still = [Camera.orbit(30.0, 50.0, 4.0, fov=FOV, width=64, height=64)] * 3
     first = _first(load_capture(write_walled(tmp_path, still)), **{"init.points": 1_000})
     assert 500 < len(first.positions) < 1_000  # those that the camera sees
-    assert first.notes == ("first points: random, for pairs of pictures agree on 0 places only",)
+    assert [(event.source, event.triangulated) for event in first.notes] == [("random", 0)]
 
 
-def test_without_pycolmap_filled_pictures_say_what_to_install(
+def test_without_pycolmap_the_event_names_what_to_install(
     filled: Capture, capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     first = _first(filled)
     assert len(first.positions) == 6_000
-    assert "pip install graings[colmap]" in first.notes[0]
+    assert "graings[colmap]" in first.notes[0].message
     assert _first(capture).notes == ()  # objects on a background are carved without it
 
 
-def test_what_a_checkpoint_was_drawn_like_does_not_depend_on_points_found_again(
+def test_resuming_does_not_depend_on_finding_the_same_initial_points(
     filled: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unbroken = micro_trainer(filled.root)
@@ -150,7 +149,7 @@ def test_what_a_checkpoint_was_drawn_like_does_not_depend_on_points_found_again(
     assert resumed.scene.sampling == unbroken.scene.sampling
 
 
-def test_places_that_pictures_agree_on_are_worth_their_time(filled: Capture) -> None:
+def test_triangulated_points_improve_quality(filled: Capture) -> None:
     found = []
     for options in ({}, {"init.min_mask_fraction": 0.0, "init.points": 600}):
         trainer = micro_trainer(filled.root, iterations=300, **{"density.max_anchors": 600}, **GROWING, **options)

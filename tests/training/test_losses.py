@@ -43,7 +43,7 @@ def test_alpha_is_the_mean_of_absolute_differences_but_for_those_below_a_level()
 
 
 @pytest.mark.parametrize("rows", [RAW, RAW[:, 2:5], RAW[:1], torch.zeros(3, 4, dtype=torch.float64)])
-def test_the_way_back_of_a_mean_square(rows: torch.Tensor) -> None:
+def test_the_gradient_of_a_mean_square(rows: torch.Tensor) -> None:
     leaf = rows.clone().requires_grad_()
     assert torch.autograd.gradcheck(losses.mean_square, (leaf,))
 

@@ -1,4 +1,4 @@
-"""Training that has lost what flies begins again with a part of the clip."""
+"""Training that has missed an object with large motion restarts with a part of the clip."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def body(home: tuple[float, ...], swing: float, semi_axes: tuple[float, ...], co
 
 
 def write_floored(folder: Path, monkeypatch: pytest.MonkeyPatch, size: int = 50) -> Path:
-    """A small red ball that flies far above a blue floor, which is behind it in most views."""
+    """A small red ball that moves far above a blue floor, which is behind it in most views."""
     floor = body((0.0, 0.0, -0.5), 0.0, (1.5, 1.5, 0.15), (0.3, 0.4, 0.8))
     ball = body((0.0, 0.0, -0.05), 0.8, (0.25, 0.25, 0.25), (0.8, 0.1, 0.1))
     monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((floor, ball))))
@@ -75,7 +75,7 @@ def again(reports: list[RunReport]) -> list[int]:
     return [r.iteration for r in reports for event in r.events if event.kind == "restart"]
 
 
-def test_a_lost_ball_makes_training_begin_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_ball_restarts_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
     config = small(**{"evaluation.first": 27, "evaluation.factor": 2.0})
     run = TrainingRun.create(capture, tmp_path / "run", config)
@@ -96,7 +96,9 @@ def test_a_lost_ball_makes_training_begin_again(tmp_path: Path, monkeypatch: pyt
     assert load_model(run.folder / "checkpoints" / "best").iteration == 432
 
 
-def test_interrupted_before_and_after_it_is_the_unbroken_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_before_and_after_a_restart_it_equals_the_unbroken_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
     unbroken = TrainingRun.create(capture, tmp_path / "unbroken", small())
     train(unbroken, LATER)
@@ -116,14 +118,14 @@ def test_interrupted_before_and_after_it_is_the_unbroken_run(tmp_path: Path, mon
     "options",
     [{"time_window": 1.0}, {"iterations": ITERATIONS - 3}, {"scene.deformation": "none", "scene.residual": False}],
 )
-def test_a_choice_a_short_run_and_a_model_without_time_stay(
+def test_a_configured_window_a_short_run_and_a_static_model_do_not_restart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
 ) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
     assert again(train(TrainingRun.create(capture, tmp_path / "run", small(**options)), MIN_STEPS + 2)) == []
 
 
-def test_too_few_views_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_few_views_do_not_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
     path = capture / "transforms_train.json"
     document = json.loads(path.read_text())
@@ -132,7 +134,7 @@ def test_too_few_views_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert again(train(TrainingRun.create(capture, tmp_path / "run", small()), MIN_STEPS + 2)) == []
 
 
-def test_what_is_trained_well_stays(tmp_path: Path) -> None:
+def test_a_clip_that_trains_well_does_not_restart(tmp_path: Path) -> None:
     capture = write_synthetic(tmp_path / "c", seed=1, frames=24, size=50)
     config = make_config(
         "draft", {"iterations": ITERATIONS, "threads": 1, "init.points": 20_000, "capture.max_side": 50}
@@ -140,11 +142,11 @@ def test_what_is_trained_well_stays(tmp_path: Path) -> None:
     assert again(train(TrainingRun.create(capture, tmp_path / "run", config), MIN_STEPS + 2)) == []
 
 
-def test_a_thing_is_lost_where_it_is_another_colour_all_over() -> None:
+def test_an_object_is_missing_where_a_whole_block_has_another_colour() -> None:
     shown = torch.full((2 * CELLS, 4 * CELLS, 3), 0.5)  # cells of 4 px
     cell = 4
     rows, columns = slice(10 * cell, (10 + BLOCK) * cell), slice(7 * cell, (7 + BLOCK) * cell)
-    for change, wide, lost in (
+    for change, wide, missing in (
         (1.01 * COLOR_DIFFERENCE, 0, True),
         (-1.01 * COLOR_DIFFERENCE, 0, True),
         (0.99 * COLOR_DIFFERENCE, 0, False),
@@ -152,12 +154,12 @@ def test_a_thing_is_lost_where_it_is_another_colour_all_over() -> None:
     ):
         drawn = shown.clone()
         drawn[rows, columns.start : columns.stop - wide, 1] += change
-        assert has_missing_object(drawn, shown) == lost
+        assert has_missing_object(drawn, shown) == missing
     assert not has_missing_object(shown, shown)
     assert not has_missing_object(torch.zeros(2, 90, 3), torch.ones(2, 90, 3))  # too flat for a block
 
 
-def test_an_attempt_has_a_window_of_its_own() -> None:
+def test_a_restart_has_its_own_time_window() -> None:
     config = small()
     assert RestartState().config(config) is config
     other = RestartState(400, 0.25).config(config)
@@ -165,7 +167,7 @@ def test_an_attempt_has_a_window_of_its_own() -> None:
     assert RestartState.of({}) == RestartState()
 
 
-def test_the_narrowest_part_with_enough_views_is_begun_with() -> None:
+def test_the_narrowest_window_with_enough_views_is_chosen() -> None:
     config = small()
     for count, part in ((200, 0.1), (60, 0.25), (20, None)):
         assert restart_window(config, np.linspace(0, 1, count).tolist()) == part

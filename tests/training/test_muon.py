@@ -67,7 +67,7 @@ def test_a_rare_direction_among_as_many_as_the_largest_layer_has_moves_two_fifth
     assert float(along.max()) < 1.25
 
 
-def test_nothing_stays_nothing() -> None:
+def test_a_zero_matrix_stays_zero() -> None:
     parameter = nn.Parameter(torch.ones(4, 3))
     muon = Muon([parameter])
     muon.step([0.1])  # no gradient yet
@@ -93,11 +93,11 @@ def test_matrices_of_geometry_are_its_own_and_all_else_is_adams() -> None:
     assert len(owned) + len(others) == len(list(scene.parameters()))
 
 
-def test_adam_takes_everything_where_it_is_asked_to() -> None:
+def test_adam_steps_everything_if_configured() -> None:
     assert Optimizer(tiny_scene(), TrainConfig(matrix_optimizer="adam"), joint_from=0).muon.parameters == []
 
 
-def test_momenta_come_back_by_name_and_those_of_adam_are_left() -> None:
+def test_momenta_are_restored_by_name() -> None:
     scene = tiny_scene()
     optimizer = Optimizer(scene, TrainConfig(), joint_from=0)
     for number, momentum in enumerate(optimizer.muon.momenta):
@@ -113,7 +113,7 @@ def test_momenta_come_back_by_name_and_those_of_adam_are_left() -> None:
     assert other.adam.state == {}
 
 
-def test_what_has_faded_counts_as_none_and_leaves_nothing_subnormal() -> None:
+def test_tiny_entries_count_as_zero_and_leave_no_subnormal_numbers() -> None:
     """A unit that nothing wakes leaves momentum that fades for ever; subnormal numbers are slow on some CPUs."""
     matrix = torch.randn(64, 64, generator=torch.Generator().manual_seed(0))
     without = matrix.clone()

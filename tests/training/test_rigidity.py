@@ -1,4 +1,4 @@
-"""Rigidity: what bends costs, what turns and flies does not, and only motion is asked to change."""
+"""Rigidity: bending costs, rotation and translation do not, and only the deformation gets a gradient."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def test_rigid_motion_costs_nothing_and_bending_does() -> None:
     canonical = compositions[0].canonical_means.detach()
     turns = torch.linalg.qr(torch.randn(len(TIMES), 3, 3, generator=torch.Generator().manual_seed(0))).Q
     flights = torch.linspace(-3, 3, len(TIMES))
-    rigid = [canonical @ turn.T + flight for turn, flight in zip(turns, flights, strict=True)]
+    rigid = [canonical @ turn.T + large_motion for turn, large_motion in zip(turns, flights, strict=True)]
     assert float(strain(scene, placed(compositions, rigid))) < 1e-5
     x, y, z = canonical.unbind(1)
     bent = [torch.stack([x + time * x.square(), y, z], 1) for time in TIMES.tolist()]
     assert float(strain(scene, placed(compositions, bent))) > 1e-2
 
 
-def test_children_that_are_nothing_at_one_instant_have_no_say() -> None:
+def test_children_invisible_at_one_time_have_no_weight() -> None:
     """Composed together, a child may be drawn in one view and be below zero in another; strain is no gain there."""
     scene = tiny_scene(anchors=60)
     compositions = together(scene)
@@ -79,7 +79,7 @@ def test_the_strain_of_a_stretched_pair_is_its_share_of_the_mean_length() -> Non
     assert float(losses.rigidity(10 * lengths, weights)) == pytest.approx(0.5 * stretched / 1.5, rel=1e-6)
 
 
-def test_only_the_motion_is_asked_to_change() -> None:
+def test_rigidity_gives_no_gradient_to_canonical_positions() -> None:
     scene = tiny_scene(anchors=60)
     strain(scene, together(scene)).backward()
     asked = {name for name, p in scene.named_parameters() if p.grad is not None and bool((p.grad != 0).any())}

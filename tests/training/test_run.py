@@ -141,7 +141,7 @@ def _refuse(constant: str) -> float:
     raise AssertionError(f"{constant} is not strict JSON")
 
 
-def test_two_trainers_do_not_share_a_folder(capture: Path, tmp_path: Path) -> None:
+def test_two_processes_do_not_train_in_one_folder(capture: Path, tmp_path: Path) -> None:
     run = TrainingRun.create(capture, tmp_path / "run", _config())
     training = iter(run)
     next(training)
@@ -183,7 +183,7 @@ def test_resuming_without_a_checkpoint_starts_over(capture: Path, tmp_path: Path
     assert TrainingRun.resume(tmp_path / "run", threads=1).iteration == 0
 
 
-def test_a_run_that_does_not_say_goes_on_as_it_began(capture: Path, tmp_path: Path) -> None:
+def test_a_resumed_run_keeps_its_options(capture: Path, tmp_path: Path) -> None:
     TrainingRun.create(capture, tmp_path / "run", _config())
     facts = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (facts["config"].pop("matrix_optimizer"), facts["config"].pop("average_from")) == ("muon", 29_000)
@@ -279,7 +279,7 @@ def test_a_disk_too_full_keeps_the_checkpoint_before_and_says_what_to_do(
 
 
 @pytest.mark.parametrize("file", ["scene.safetensors", "state.safetensors", "checkpoint.json"])
-def test_a_damaged_newest_checkpoint_costs_the_steps_since_the_one_before(
+def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(
     capture: Path, tmp_path: Path, file: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = tmp_path / "run"
@@ -299,7 +299,7 @@ def test_a_damaged_newest_checkpoint_costs_the_steps_since_the_one_before(
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"not a tensor file"])
-def test_a_damaged_best_checkpoint_stops_nobody(
+def test_a_damaged_best_checkpoint_does_not_stop_a_run(
     capture: Path, tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = TrainingRun.create(capture, tmp_path / "run", _config())
@@ -350,7 +350,7 @@ def test_test_split_is_measured_only_when_asked(capture: Path, tmp_path: Path) -
     assert set(document["splits"]) == {"val", "test"}
 
 
-def test_a_single_instant_leaves_the_deformation_out_and_says_so(capture: Path, tmp_path: Path) -> None:
+def test_a_single_time_drops_the_deformation_and_the_plan_says_so(capture: Path, tmp_path: Path) -> None:
     still = tmp_path / "still"
     still.mkdir()
     for name in ("train", "val", "test"):
@@ -394,7 +394,7 @@ def test_every_ablation_of_the_paper_trains_and_renders(
     assert reports[-1].evaluation.psnr > 8
 
 
-def test_options_of_another_version_are_named_and_not_taken_for_damage(capture: Path, tmp_path: Path) -> None:
+def test_unknown_options_are_named_and_not_reported_as_damage(capture: Path, tmp_path: Path) -> None:
     run = TrainingRun.create(capture, tmp_path / "run", _config(iterations=2))
     list(run)
     for path in (tmp_path / "run" / "run.json", *(tmp_path / "run").glob("checkpoints/*/checkpoint.json")):
@@ -406,7 +406,7 @@ def test_options_of_another_version_are_named_and_not_taken_for_damage(capture: 
             read(tmp_path / "run")
 
 
-def test_a_model_remembers_whose_pixels_its_low_pass_counts(capture: Path, tmp_path: Path) -> None:
+def test_a_model_stores_the_sampling_rate_of_its_low_pass(capture: Path, tmp_path: Path) -> None:
     run = TrainingRun.create(capture, tmp_path / "run", _config(iterations=12))
     list(run)
     cameras = [frame.camera for frame in run.capture.train]

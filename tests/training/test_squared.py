@@ -9,7 +9,7 @@ import torch
 from tests.training.micro import GROWING, micro_trainer, steps
 
 
-def test_squares_join_after_the_last_growth(micro: Path) -> None:
+def test_the_squared_error_starts_after_the_last_growth(micro: Path) -> None:
     without, weighed = (micro_trainer(micro, **GROWING, **{"loss.squared": weight}) for weight in (0.0, 10.0))
     last = weighed.config.scaled(weighed.config.density.grow_until)
     assert 0 < last < weighed.config.iterations
@@ -24,7 +24,7 @@ def test_squares_join_after_the_last_growth(micro: Path) -> None:
     assert not all(torch.equal(a, b) for a, b in zip(*pairs, strict=True))
 
 
-def test_a_heavy_weight_is_no_divergence(micro: Path) -> None:
+def test_a_large_weight_of_the_squared_error_is_no_divergence(micro: Path) -> None:
     """The guard compares losses of before and after: what has joined is not what went wrong."""
     trainer = micro_trainer(micro, **GROWING, **{"loss.squared": 1_000.0, "guard.patience": 5})
     last = trainer.config.scaled(trainer.config.density.grow_until)

@@ -35,7 +35,7 @@ def _predicted_deformation(batch: Gaussians, share: Tensor) -> Gaussians:
     return replace(batch, means=batch.means + (_rotations(batch.quats) @ local.unsqueeze(2)).squeeze(2))
 
 
-def test_a_step_is_measured_in_sizes_of_what_is_there_both_times() -> None:
+def test_a_step_is_measured_on_gaussians_drawn_before_and_after_it() -> None:
     sharp = pinhole(focal=1e12)  # sees everything: no pixel widens a Gaussian
     before = gaussians(1_000, seed=0)
     after = _predicted_deformation(before, torch.linspace(0, 1, 1_000, dtype=torch.float64))
@@ -47,16 +47,16 @@ def test_a_step_is_measured_in_sizes_of_what_is_there_both_times() -> None:
     assert step_over_size(rows(before, torch.arange(10)), rows(after, torch.arange(10, 20)), sharp, BLUR) is None
 
 
-def test_what_is_lost_has_no_length() -> None:
+def test_a_step_to_a_position_that_is_not_finite_has_no_length() -> None:
     before = gaussians(10, seed=0)
-    for lost in (math.nan, math.inf):
+    for bad in (math.nan, math.inf):
         means = before.means.clone()
-        means[3, 1] = lost
+        means[3, 1] = bad
         assert step_over_size(before, replace(before, means=means), pinhole(), BLUR) is None
 
 
-def test_a_step_that_was_undone_is_not_told_of(micro: Path) -> None:
-    """Metrics hold finite numbers only: a lost scene is measured, found, and forgotten with the step."""
+def test_a_rolled_back_step_is_not_reported(micro: Path) -> None:
+    """Metrics hold finite numbers only: a step that leads to a NaN is measured, detected and rolled back."""
     trainer = micro_trainer(micro, **{"guard.check_every": 5})
     steps(trainer, 34)
     good = trainer.snapshots.newest.facts["step_over_size"]
@@ -68,7 +68,7 @@ def test_a_step_that_was_undone_is_not_told_of(micro: Path) -> None:
     assert trainer.step_over_size == good
 
 
-def test_a_run_that_goes_on_knows_how_long_its_last_steps_were(micro: Path) -> None:
+def test_a_resumed_run_keeps_the_measured_length_of_its_last_steps(micro: Path) -> None:
     """A point of the curve soon after a checkpoint says so too, measured or not since."""
     first = micro_trainer(micro, **{"guard.check_every": 5})
     steps(first, 7)
@@ -78,7 +78,7 @@ def test_a_run_that_goes_on_knows_how_long_its_last_steps_were(micro: Path) -> N
     assert second.step_over_size == first.step_over_size
 
 
-def test_what_is_thinner_than_a_pixel_is_as_wide_as_the_low_pass() -> None:
+def test_a_gaussian_thinner_than_a_pixel_is_as_wide_as_the_low_pass() -> None:
     """A disc far thinner than a pixel, moved by a pixel: one over the root of the blur's variance."""
     camera = pinhole(focal=40.0)
     disc = replace(
@@ -122,7 +122,7 @@ def _frame(focal: float) -> Frame:
     return Frame("view", seen, 0.5, Path("view.png"), (32, 32))
 
 
-def test_what_one_view_resolves_is_not_below_the_pixel() -> None:
+def test_a_gaussian_resolved_in_one_view_does_not_count_as_subpixel() -> None:
     scene = tiny_scene(anchors=40)
     far, middle, near = _frame(0.1), _frame(8.0), _frame(60.0)
     shares = [subpixel_share(scene, [frame], WHITE) for frame in (far, middle, near)]
@@ -148,7 +148,7 @@ def test_a_ratio_of_a_million_in_one_scene_trains_and_is_reported(micro: Path) -
     assert math.isfinite(trainer.step_over_size)
 
 
-def test_a_run_says_how_stiff_it_was(micro: Path, tmp_path: Path) -> None:
+def test_a_run_reports_its_stiffness(micro: Path, tmp_path: Path) -> None:
     """In every point of its curve and at its end; where steps are long, it depends on the last bit how long."""
     found = {}
     for name, rate in (("calm", 1e-5), ("wild", 2.0)):
@@ -167,7 +167,7 @@ def test_a_run_says_how_stiff_it_was(micro: Path, tmp_path: Path) -> None:
     assert found["wild"] > 10 * found["calm"]
 
 
-def test_what_is_longer_than_itself_is_stiff_and_told_with_its_remedy() -> None:
+def test_a_step_longer_than_its_gaussian_is_reported_with_a_remedy() -> None:
     (event,) = Stiffness(1.5, 0.0, 6).events(100)
     assert (event.iteration, event.step_over_size) == (100, 1.5)
     assert event.message == (

@@ -93,7 +93,7 @@ def test_a_run_with_a_bad_loss_is_as_good_as_a_clean_one(
 
 
 @pytest.mark.parametrize("moment", ["exp_avg", "exp_avg_sq"])
-def test_a_bad_moment_is_noticed_and_training_goes_back(micro: Path, moment: str) -> None:
+def test_a_bad_moment_estimate_is_detected_and_training_rolls_back(micro: Path, moment: str) -> None:
     """E02, one number of Adam's state at step 52: it reaches the parameter, not the model that is kept.
 
     Half the rates, and the steps thrown away, cost a run this short; going back must cost none beyond those.
@@ -101,7 +101,7 @@ def test_a_bad_moment_is_noticed_and_training_goes_back(micro: Path, moment: str
     slower = micro_trainer(micro)
     steps(slower, 50)
     slower.optimizer.damping = 0.5
-    slower.iteration = 55  # noticed here: the schedule runs on, the five steps are lost
+    slower.iteration = 55  # detected here: the schedule continues, the five steps are not repeated
     steps(slower, 145)
     trainer = micro_trainer(micro)
     steps(trainer, 52)
@@ -139,9 +139,7 @@ def test_three_bad_steps_in_a_row_restore_scene_moments_streams_and_statistics(
     assert trainer.views.sampler.generator is trainer.streams["sampler.1"]
 
 
-def test_going_back_in_vain_goes_back_further_and_in_the_end_gives_up(
-    micro: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_repeated_rollbacks_go_further_back_and_end_in_divergence(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = micro_trainer(micro)
     steps(trainer, 60)
     spoil_loss(monkeypatch, trainer, lambda i: i > 60)
@@ -155,7 +153,7 @@ def test_going_back_in_vain_goes_back_further_and_in_the_end_gives_up(
     assert finite(trainer)
 
 
-def test_a_loss_that_runs_away_with_finite_numbers_goes_back(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_growing_finite_loss_rolls_back(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = micro_trainer(micro, **{"guard.patience": 20})
     steps(trainer, 100)
     spoil_loss(monkeypatch, trainer, lambda i: i > 100, factor=50.0)
@@ -184,7 +182,7 @@ def test_a_hundredfold_rate_ends_converged_or_diverged_with_a_model_that_renders
     assert model.finished is not diverged
 
 
-def test_a_finite_spike_is_limited_and_does_not_freeze_its_parameter(micro: Path) -> None:
+def test_a_finite_spike_is_clipped_and_does_not_freeze_its_parameter(micro: Path) -> None:
     """E03: 1e10 in one entry; the updates of that entry afterwards against those of its undisturbed neighbour."""
     trainer = micro_trainer(micro, iterations=300)
     # Where all gradients are the same, the normal size of an update is the rate.
@@ -229,7 +227,7 @@ def test_a_finite_spike_does_not_stop_the_rest_of_its_matrix(micro: Path) -> Non
 
 
 @pytest.mark.parametrize(("number", "drift"), [(0.0, 0.0), (1e-25, 1e-8)])
-def test_gradients_that_are_nothing_or_almost_move_nothing(micro: Path, number: float, drift: float) -> None:
+def test_zero_and_tiny_gradients_do_not_change_parameters(micro: Path, number: float, drift: float) -> None:
     """E04: 100 steps."""
     trainer = micro_trainer(micro)
     before = {name: value.detach().clone() for name, value in trainer.scene.named_parameters()}
@@ -247,7 +245,7 @@ def _peak_bytes() -> int:
 
 
 @pytest.mark.parametrize("batch", [1, 4])
-def test_growth_without_end_stops_at_the_budget(micro: Path, batch: int) -> None:
+def test_growth_stops_at_the_budget(micro: Path, batch: int) -> None:
     """E05: everything grows on six levels; the budget is that of the memory, and the memory is not exceeded."""
     memory_mb = 4
     trainer = micro_trainer(
@@ -277,7 +275,7 @@ def test_growth_without_end_stops_at_the_budget(micro: Path, batch: int) -> None
     assert finite(trainer)
 
 
-def test_anchors_that_show_nothing_make_room_for_growth(micro: Path) -> None:
+def test_faint_anchors_are_pruned_to_make_room_for_growth(micro: Path) -> None:
     growing = {"density.statistics_from": 0, "density.grow_from": 0, "density.grow_until": 30_000}
     eager = {"density.grow_every": 10, "density.gradient_threshold": 1e-9, "density.prune_min_views": 15}
     trainer = micro_trainer(micro, **growing, **eager, **{"density.max_anchors": 60})
@@ -294,7 +292,7 @@ def test_anchors_that_show_nothing_make_room_for_growth(micro: Path) -> None:
     assert len(uids) <= 60
 
 
-def test_more_than_the_budget_from_the_first_step_on_is_thinned(micro: Path) -> None:
+def test_initial_anchors_above_the_budget_are_thinned(micro: Path) -> None:
     growing = {"density.statistics_from": 0, "density.grow_from": 0, "density.grow_until": 30_000}
     eager = {"density.grow_every": 10, "density.prune_min_views": 15}
     found = {}
@@ -350,7 +348,7 @@ def test_single_and_double_precision_learn_alike(micro: Path) -> None:
 
 @pytest.mark.parametrize("projected", [True, False])
 @pytest.mark.parametrize("bias", [3.0, -3.0])
-def test_a_log_scale_beyond_its_clip_comes_back(micro: Path, bias: float, projected: bool) -> None:
+def test_a_log_scale_beyond_its_clip_recovers(micro: Path, bias: float, projected: bool) -> None:
     """E09: by the image where the gradient is projected, by the regulariser alone where it is not."""
     options = {"scene.projected_clip": projected, "rates.deformation": [0.005, 0.005], "loss.deformation": 0.01}
     trainer = micro_trainer(micro, iterations=400, warmup=0, **options)
@@ -372,7 +370,7 @@ def _drive(trainer: Trainer, layer: nn.Module, bias: float) -> None:
 
 
 @pytest.mark.parametrize(("bias", "ground"), [(20.0, "black"), (-20.0, "white")])
-def test_saturated_colours_come_back(micro: Path, bias: float, ground: str) -> None:
+def test_saturated_colours_recover(micro: Path, bias: float, ground: str) -> None:
     """E10: logits at 20 give a gradient of exactly 0 where it is formed from the value.
 
     Biases may stay where they are: what brings the colours back is mostly the weights. The ground is of the other
@@ -396,7 +394,7 @@ def test_saturated_colours_come_back(micro: Path, bias: float, ground: str) -> N
 def test_a_saturated_opacity_has_a_gradient_and_falls_where_the_data_want_it(micro: Path) -> None:
     """E11: at 20 the gradient is there; from 12 on it is large enough for Adam's epsilon.
 
-    A step moves a score by its rate times the hidden units that are awake: at 0.05, 96 of them leap to a score of 40.
+    A step changes an opacity logit by its rate times the number of active hidden units: at 0.05, 96 of them reach 40.
     """
     trainer = micro_trainer(micro, **{"rates.opacity": [0.016, 0.016]})
     last = trainer.scene.appearance.opacity[-1]
@@ -417,7 +415,7 @@ def test_a_saturated_opacity_has_a_gradient_and_falls_where_the_data_want_it(mic
     assert quality(trainer) > before + 10
 
 
-def test_a_scene_in_which_all_is_hidden_is_shown_again_once_and_then_goes_back(micro: Path) -> None:
+def test_a_collapsed_scene_gets_its_opacity_raised_once_and_then_rolls_back(micro: Path) -> None:
     """E12."""
     trainer = micro_trainer(micro)
     last = trainer.scene.appearance.opacity[-1]
@@ -480,11 +478,11 @@ def test_a_quaternion_and_its_negative_draw_the_same_bits() -> None:
     """E14."""
     batch, camera = overlapping()
     white = torch.ones(3, dtype=torch.float64)
-    pictures = [rasterize(replace(batch, quats=sign * batch.quats), camera, white).color for sign in (1, -1)]
-    assert torch.equal(*pictures)
+    images = [rasterize(replace(batch, quats=sign * batch.quats), camera, white).color for sign in (1, -1)]
+    assert torch.equal(*images)
 
 
-def test_children_born_in_one_place_part(micro: Path) -> None:
+def test_children_created_at_one_position_separate(micro: Path) -> None:
     """E18: 100 iterations after the birth of anchors with zero offsets, of which some view has seen something."""
     trainer = micro_trainer(micro, **GROWING)
     old = trainer.density.next_uid
@@ -499,7 +497,7 @@ def test_children_born_in_one_place_part(micro: Path) -> None:
 
 
 @pytest.mark.parametrize("newborn", [None, 0.02])
-def test_growing_does_not_tear_the_picture(micro: Path, monkeypatch: pytest.MonkeyPatch, newborn: float | None) -> None:
+def test_growth_hardly_changes_the_image(micro: Path, monkeypatch: pytest.MonkeyPatch, newborn: float | None) -> None:
     """E19: quality right before and right after each growth; newborns as opaque as their parent, and faint ones."""
     trainer = micro_trainer(micro, **GROWING, **{"density.new_anchor_opacity": newborn})
     drops: list[float] = []
@@ -518,13 +516,13 @@ def test_growing_does_not_tear_the_picture(micro: Path, monkeypatch: pytest.Monk
     assert max(drops) <= 0.5
 
 
-def test_a_saved_scene_draws_the_bits_that_it_drew_before(micro: Path, tmp_path: Path) -> None:
+def test_a_saved_scene_renders_the_same_bits(micro: Path, tmp_path: Path) -> None:
     """E20, float32."""
     run = TrainingRun.create(micro, tmp_path / "run", micro_config(iterations=30))
     list(run)
     model = load_model(tmp_path / "run")
     frame = run.capture.train[2]
-    pictures = [
+    images = [
         render(scene, frame.camera, frame.time, model.background).color for scene in (run._trainer.scene, model.scene)
     ]
-    assert torch.equal(*pictures)
+    assert torch.equal(*images)

@@ -27,12 +27,12 @@ def test_the_window_widens_from_the_middle_to_the_whole_clip() -> None:
     assert taking_part(11_000) == taking_part(30_000) == TIMES
 
 
-def test_a_window_narrower_than_the_frames_keeps_the_view_in_the_middle() -> None:
+def test_a_window_narrower_than_the_frame_interval_keeps_the_middle_view() -> None:
     window = TimeWindow(make_config("paper"), [0.0, 0.4, 1.0], 1e-6)
     assert [window.has(view, 0) for view in range(3)] == [False, True, False]
 
 
-def test_views_outside_the_window_are_not_drawn_until_it_is_wide(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_outside_the_window_are_not_used_until_it_is_wide(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = micro_trainer(micro, iterations=60, time_window=0.3)
     drawn: list[float] = []
     rgb = trainer.images.rgb
@@ -47,7 +47,7 @@ def test_views_outside_the_window_are_not_drawn_until_it_is_wide(micro: Path, mo
     assert {0.0, 1.0} <= set(drawn[30:])
 
 
-def test_a_pass_ends_with_the_last_view_that_takes_part(micro: Path) -> None:
+def test_a_pass_ends_with_the_last_view_inside_the_window(micro: Path) -> None:
     trainer = micro_trainer(micro, iterations=600, time_window=0.3)
     within = sum(trainer.window.has(view, 1) for view in range(len(trainer.capture.train)))
     assert 1 < within < len(trainer.capture.train)
@@ -58,7 +58,7 @@ def test_a_pass_ends_with_the_last_view_that_takes_part(micro: Path) -> None:
     assert ends == ([False] * (within - 1) + [True]) * 3
 
 
-def test_it_is_the_same_after_an_interruption(micro: Path) -> None:
+def test_an_interrupted_training_equals_the_unbroken_one(micro: Path) -> None:
     options = {"iterations": 40, "time_window": 0.3}
     whole, first, second = (micro_trainer(micro, **options) for _ in range(3))
     steps(whole, 20)

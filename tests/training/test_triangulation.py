@@ -1,4 +1,4 @@
-"""Places in space that pairs of pictures agree on."""
+"""Triangulation of points from pairs of images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PIXEL = DISTANCE * FOV / SIZE  # on the scene
 Array = NDArray[np.float64]
 
 
-def _places(folder: Path) -> Array:
+def _points(folder: Path) -> Array:
     capture = load_capture(folder)
     found = triangulate(capture.train, ImageStore((1.0, 1.0, 1.0)))
     assert len(found.fill_untextured) == 0 or len(found.points) > 0
@@ -35,41 +35,41 @@ def _cameras(azimuths: Sequence[float]) -> list[Camera]:
     return [Camera.orbit(a, 50.0, DISTANCE, fov=FOV, width=SIZE, height=SIZE) for a in azimuths]
 
 
-def _written(folder: Path, cameras: Sequence[Camera], pictures: Sequence[NDArray[np.uint8]]) -> Path:
+def _written(folder: Path, cameras: Sequence[Camera], images: Sequence[NDArray[np.uint8]]) -> Path:
     frames = []
-    for index, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
-        write_image(folder / f"train/{index:03d}.png", picture)
+    for index, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        write_image(folder / f"train/{index:03d}.png", image)
         frames.append(entry(camera, f"train/{index:03d}", index / len(cameras)))
     write_transforms(folder, "train", frames)
     return folder
 
 
-def test_places_lie_on_what_the_pictures_show(tmp_path: Path) -> None:
-    places = _places(write_walled(tmp_path, _cameras(range(0, 80, 10))))
-    height = np.abs(places[:, 2])
-    print(f"{len(places)} places, {np.median(height):.4f} from the wall, nine of ten {np.quantile(height, 0.9):.4f}")
-    assert len(places) > 150
+def test_triangulated_points_lie_on_the_surface(tmp_path: Path) -> None:
+    points = _points(write_walled(tmp_path, _cameras(range(0, 80, 10))))
+    height = np.abs(points[:, 2])
+    print(f"{len(points)} points, {np.median(height):.4f} from the wall, nine of ten {np.quantile(height, 0.9):.4f}")
+    assert len(points) > 150
     assert np.median(height) < 0.5 * PIXEL
     assert np.quantile(height, 0.9) < 3 * PIXEL
 
 
-def test_pictures_that_have_nothing_in_common_agree_on_next_to_nothing(tmp_path: Path) -> None:
+def test_unrelated_images_give_hardly_any_points(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
-    pictures = [random.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8) for _ in range(8)]
-    assert len(_places(_written(tmp_path, _cameras(range(0, 80, 10)), pictures))) < 20
+    images = [random.integers(0, 256, (SIZE, SIZE, 3), dtype=np.uint8) for _ in range(8)]
+    assert len(_points(_written(tmp_path, _cameras(range(0, 80, 10)), images))) < 20
 
 
-def test_pictures_in_which_nothing_stands_out_agree_on_nothing(tmp_path: Path) -> None:
+def test_images_without_texture_give_no_points(tmp_path: Path) -> None:
     flat = np.full((SIZE, SIZE, 3), 128, np.uint8)
-    assert _places(_written(tmp_path, _cameras([0, 10, 20]), [flat] * 3)).shape == (0, 3)
+    assert _points(_written(tmp_path, _cameras([0, 10, 20]), [flat] * 3)).shape == (0, 3)
 
 
 @pytest.mark.parametrize("azimuths", [[30.0], [30.0] * 4, [30.0, 31.0], [0.0, 180.0]])
-def test_cameras_that_tell_no_depth_give_no_places(tmp_path: Path, azimuths: list[float]) -> None:
-    assert _places(write_walled(tmp_path, _cameras(azimuths))).shape == (0, 3)
+def test_cameras_without_parallax_give_no_points(tmp_path: Path, azimuths: list[float]) -> None:
+    assert _points(write_walled(tmp_path, _cameras(azimuths))).shape == (0, 3)
 
 
-def test_long_clips_cost_no_more_than_their_sixty_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_clips_use_a_limited_number_of_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_walled(tmp_path, _cameras(range(0, 80, 10)))
     monkeypatch.setattr(triangulation, "IMAGES", 3)
     capture = load_capture(folder)
@@ -84,7 +84,7 @@ def test_long_clips_cost_no_more_than_their_sixty_pictures(tmp_path: Path, monke
     assert read == [capture.train[index].name for index in (0, 3, 6)]
 
 
-def test_what_lies_between_places_is_as_deep_as_the_nearest(tmp_path: Path) -> None:
+def test_filled_points_have_the_depth_of_the_nearest_point(tmp_path: Path) -> None:
     camera = _cameras([20.0])[0]
     part = SIZE / 12
     ends = np.array([[0.4 * part, 0.4 * part], [SIZE - 0.4 * part, 0.4 * part]])
@@ -105,33 +105,33 @@ def test_what_lies_between_places_is_as_deep_as_the_nearest(tmp_path: Path) -> N
     )
 
 
-def test_large_pictures_are_looked_at_as_small_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_images_are_downscaled_for_sift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_walled(tmp_path, _cameras(range(0, 80, 10)))
     monkeypatch.setattr(triangulation, "MAX_SIFT_SIDE", 64)
     small = load_capture(folder, CaptureConfig(max_side=64))
     found, same = (triangulate(each.train, ImageStore((1.0, 1.0, 1.0))) for each in (load_capture(folder), small))
     assert len(found.points) > 100
-    np.testing.assert_array_equal(found.points, same.places)
+    np.testing.assert_array_equal(found.points, same.points)
 
 
-def test_rays_meet_where_both_cameras_saw_it() -> None:
+def test_rays_intersect_at_the_true_point() -> None:
     one, other = _cameras([0.0, 25.0])
-    places = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 3))
-    pixels, others = (_pixels(camera, places) for camera in (one, other))
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 3))
+    pixels, others = (_pixels(camera, points) for camera in (one, other))
     met, found = ray_intersections(one, other, pixels, others)
     assert met.tolist() == list(range(50))
-    np.testing.assert_allclose(found, places, atol=1e-9)
-    # Off the line that the other ray draws in the picture, the two do not meet.
+    np.testing.assert_allclose(found, points, atol=1e-9)
+    # Off the line that the other ray draws in the image, the two do not intersect.
     some = others + np.where(np.arange(50) % 2 == 0, 0.0, 40.0)[:, None] * np.array([0.0, 1.0])
     met, found = ray_intersections(one, other, pixels, some)
     assert met.tolist() == list(range(0, 50, 2))
-    np.testing.assert_allclose(found, places[::2], atol=1e-9)
+    np.testing.assert_allclose(found, points[::2], atol=1e-9)
     # These two diverge: where their lines come near each other is behind both cameras.
     apart = np.array([[0.0, 0.5 * SIZE]]), np.array([[float(SIZE), 0.5 * SIZE]])
     assert sorted(len(ray_intersections(one, other, *ends)[0]) for ends in (apart, apart[::-1])) == [0, 1]
 
 
-def test_matches_that_share_a_feature_are_one_thing() -> None:
+def test_matches_that_share_a_feature_form_one_track() -> None:
     links = np.array([[0, 4, 2, 7, 5], [1, 5, 1, 8, 2]])
     assert tracks(links, 10).tolist() == [0, 0, 0, 7, 0]
     chain = np.stack([np.arange(1, 1000), np.arange(999)])[:, ::-1]
@@ -139,8 +139,8 @@ def test_matches_that_share_a_feature_are_one_thing() -> None:
     assert tracks(np.empty((2, 0), np.int64), 10).shape == (0,)
 
 
-def _pixels(camera: Camera, places: Array) -> Array:
-    local = places @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+def _pixels(camera: Camera, points: Array) -> Array:
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     return np.column_stack(
         [camera.fx * local[:, 0] / local[:, 2] + camera.cx, camera.fy * local[:, 1] / local[:, 2] + camera.cy]
     )

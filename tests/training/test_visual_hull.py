@@ -25,16 +25,16 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @pytest.fixture
-def flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A small ball that flies to and fro, three times its own width, and turns around at the middle of the clip."""
+def large_motion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small ball that moves to and fro, three times its own width, and turns around at the middle of the clip."""
     ball = _ball(np.zeros(3), np.array([0.8, 0.3, 0.0]), 0.24)
     monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((ball,))))
-    return write_synthetic(tmp_path / "flight", frames=48, size=40)
+    return write_synthetic(tmp_path / "large_motion", frames=48, size=40)
 
 
 @pytest.fixture
 def accompanied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A large ball that stays in the middle, and well above it a small one that flies to and fro."""
+    """A large ball that stays in the middle, and well above it a small one that moves to and fro."""
     still = _ball(np.zeros(3), np.zeros(3), 0.5)
     small = _ball(np.array([0.0, 0.0, 0.9]), np.array([0.8, 0.3, 0.0]), 0.2)
     monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((still, small))))
@@ -64,17 +64,17 @@ def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
     return len(first.positions), first.time_window
 
 
-def test_a_clip_in_which_nothing_stays_in_place_begins_with_a_part_of_it(flight: Path) -> None:
-    count, window = _found(flight, _draft())
+def test_a_clip_with_large_motion_begins_with_a_part_of_it(large_motion: Path) -> None:
+    count, window = _found(large_motion, _draft())
     assert 0.1 <= window < 1
     assert 100 <= count < 6_000  # of 60 000
-    assert _found(flight, _draft(time_window=1.0)) == (60_000, 1.0)
+    assert _found(large_motion, _draft(time_window=1.0)) == (60_000, 1.0)
 
 
-def test_no_more_points_are_first_anchors_than_may_be(flight: Path) -> None:
-    every, _ = _found(flight, _draft())
-    assert _found(flight, _draft(**{"init.max_points": 50}))[0] == 50 < every
-    data = load_capture(flight)
+def test_the_number_of_initial_anchors_is_limited(large_motion: Path) -> None:
+    every, _ = _found(large_motion, _draft())
+    assert _found(large_motion, _draft(**{"init.max_points": 50}))[0] == 50 < every
+    data = load_capture(large_motion)
     cloud = replace(data, points=PointCloud(_grid(), np.zeros_like(_grid(), np.float32)))
     for capture in (data, cloud):
         points, few = (
@@ -89,20 +89,20 @@ def test_no_more_points_are_first_anchors_than_may_be(flight: Path) -> None:
         assert len(most) == (100 if capture is cloud else every)
 
 
-def test_a_clip_in_which_things_stay_in_place_begins_as_a_whole(tmp_path: Path) -> None:
+def test_a_clip_with_small_motion_begins_as_a_whole(tmp_path: Path) -> None:
     capture = write_synthetic(tmp_path / "c", seed=1, frames=24, size=40)
     for options in ({}, {"time_window": 1.0}):
         count, window = _found(capture, _draft(**options))
         assert (count < 30_000, window) == (True, 1.0)
 
 
-def test_what_flies_is_not_lost(flight: Path) -> None:
+def test_an_object_with_large_motion_is_found(large_motion: Path) -> None:
     gains = []
     for seed in range(3):  # they lie a decibel apart
         found = []
         for options in ({}, {"time_window": 1.0}):
             few = {"iterations": 400, "seed": seed, "init.points": 20_000}
-            trainer = micro_trainer(flight, **few, **GROWING, **options)
+            trainer = micro_trainer(large_motion, **few, **GROWING, **options)
             reports = steps(trainer, 400)
             assert len(events_of(reports[:1], "time_window")) == (0 if options else 1)
             assert events_of(reports[1:], "time_window") == []
@@ -112,23 +112,23 @@ def test_what_flies_is_not_lost(flight: Path) -> None:
     assert mean(gains) > 2
 
 
-def test_too_few_views_do_not_speak_for_a_part_of_the_clip(flight: Path) -> None:
+def test_a_window_with_too_few_views_is_not_tried(large_motion: Path) -> None:
     config = make_config("draft")
-    data = load_capture(flight, config.capture)
+    data = load_capture(large_motion, config.capture)
     few = replace(data, train=data.train[::4])
     assert initial_points(few, ImageStore(WHITE), config, RandomStreams(0)).time_window == 1.0
 
 
 @pytest.mark.parametrize("window", [None, 0.25])
-def test_a_clip_with_nothing_in_sight_at_its_middle_is_not_taken_for_empty(flight: Path, window: float | None) -> None:
-    for frame in load_capture(flight).train:
+def test_a_clip_whose_middle_is_empty_is_not_refused(large_motion: Path, window: float | None) -> None:
+    for frame in load_capture(large_motion).train:
         if abs(frame.time - 0.5) < 0.3:
             write_image(frame.image_path, np.zeros((40, 40, 4), np.uint8))
-    assert _found(flight, _draft(time_window=window)) == (60_000, window or 1.0)
+    assert _found(large_motion, _draft(time_window=window)) == (60_000, window or 1.0)
 
 
-def test_what_looks_like_the_background_has_no_points(flight: Path) -> None:
-    data = load_capture(flight)
+def test_background_pixels_get_no_points(large_motion: Path) -> None:
+    data = load_capture(large_motion)
     red, none = (masked(data.train[:4], ImageStore(colour), colour) for colour in (WHITE, (0.0, 0.0, 0.0)))
     for one, other in zip(red, none, strict=True):
         alpha = ImageStore(WHITE).alpha(one.frame)
@@ -140,33 +140,33 @@ def test_what_looks_like_the_background_has_no_points(flight: Path) -> None:
     assert masked(data.train[:1], ImageStore(WHITE), own)[0].mask.sum() < red[0].mask.sum()
 
 
-def test_pictures_without_alpha_show_what_is_not_of_the_background(flight: Path) -> None:
-    transparent = load_capture(flight).train[:4]
+def test_masks_without_alpha_exclude_the_background_colour(large_motion: Path) -> None:
+    transparent = load_capture(large_motion).train[:4]
     ours = masked(transparent, ImageStore(WHITE), WHITE)
-    without_alpha(flight)
-    flat = load_capture(flight).train[:4]
+    without_alpha(large_motion)
+    flat = load_capture(large_motion).train[:4]
     for one, other in zip(ours, masked(flat, ImageStore(WHITE), WHITE), strict=True):
         assert (one.mask & ~other.mask).sum() == 0  # a rim that is half there counts too
         assert one.mask.sum() <= other.mask.sum() < 2 * one.mask.sum() < one.mask.size / 5
     assert all(view.mask.all() and view.opaque for view in masked(flat, ImageStore(WHITE), (0.0, 0.0, 1.0)))
 
 
-def test_without_alpha_a_clip_begins_with_as_few_points_and_the_same_part_of_it(flight: Path) -> None:
-    count, window = _found(flight, _draft())
-    without_alpha(flight)
-    flat, same = _found(flight, _draft())
+def test_without_alpha_the_same_points_and_window_are_chosen(large_motion: Path) -> None:
+    count, window = _found(large_motion, _draft())
+    without_alpha(large_motion)
+    flat, same = _found(large_motion, _draft())
     assert same == window
     assert count <= flat < 1.5 * count
 
 
-def test_pictures_of_the_background_alone_leave_all_points(flight: Path) -> None:
-    for frame in load_capture(flight).train:
+def test_images_of_background_only_keep_all_points(large_motion: Path) -> None:
+    for frame in load_capture(large_motion).train:
         write_image(frame.image_path, np.full((40, 40, 3), 255, np.uint8))
-    assert _found(flight, _draft()) == (60_000, 1.0)
+    assert _found(large_motion, _draft()) == (60_000, 1.0)
 
 
-def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
-    data = load_capture(flight)
+def test_points_inside_the_ball_are_kept_and_cover_it(large_motion: Path) -> None:
+    data = load_capture(large_motion)
     views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
     kept = visual_hull(_grid(), views, 0.6, 50)
     assert 0 < len(kept) < 0.05 * len(_grid())
@@ -175,7 +175,7 @@ def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
     assert coverage(kept[:1], views, 50) < coverage(kept, views, 50)
 
 
-def test_what_stands_still_has_no_fog_about_it_and_what_flies_beside_it_keeps_its_points(accompanied: Path) -> None:
+def test_a_static_object_gets_a_tight_hull_and_a_moving_one_keeps_its_points(accompanied: Path) -> None:
     data = load_capture(accompanied)
     views = masked(data.train[16:32], ImageStore(WHITE), WHITE)
     found = []
@@ -190,15 +190,15 @@ def test_what_stands_still_has_no_fog_about_it_and_what_flies_beside_it_keeps_it
     assert fog_left < 0.1 * count
 
 
-def test_where_few_points_would_be_left_all_that_are_allowed_stay(flight: Path) -> None:
-    data = load_capture(flight)
+def test_a_hull_of_few_points_keeps_all_of_them(large_motion: Path) -> None:
+    data = load_capture(large_motion)
     views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
     many, few = (len(visual_hull(_grid()[::step], views, 0.6, 50)) * step for step in (1, 8))
     assert few >= 8 * MIN_POINTS
     assert few > 1.5 * many
 
 
-def test_a_small_thing_without_points_is_not_covered_by_a_large_one(accompanied: Path) -> None:
+def test_a_small_component_without_points_lowers_the_coverage(accompanied: Path) -> None:
     data = load_capture(accompanied)
     places = data.units.points_back(_grid())
     large = np.linalg.norm(places, axis=-1) < 0.5
@@ -212,7 +212,7 @@ def test_a_small_thing_without_points_is_not_covered_by_a_large_one(accompanied:
     assert coverage(_grid()[large | small], ends[:4] + middle, 50) < MIN_COVERAGE
 
 
-def test_a_small_thing_that_flies_is_reason_enough_to_begin_with_a_part_of_the_clip(accompanied: Path) -> None:
+def test_a_small_object_with_large_motion_shortens_the_window(accompanied: Path) -> None:
     for seed in range(3):
         data = load_capture(accompanied)
         assert initial_points(data, ImageStore(WHITE), make_config("draft"), RandomStreams(seed)).time_window < 1
