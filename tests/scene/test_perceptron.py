@@ -1,4 +1,4 @@
-"""The compiled chain of layers: equal to torch, within a derived bound in float32, same bits on any thread count."""
+"""The compiled perceptron: equal to torch, within a derived bound in float32, same bits for any number of threads."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Chain:
 
 
 def chain(widths: tuple[int, ...], rows: int, seed: int = 0) -> Chain:
-    """Weights of the usual spread, all numbers exact in float32."""
+    """Weights of the usual initial variance; all numbers are exact in float32."""
     random = torch.Generator().manual_seed(seed + rows + 1000 * len(widths))
     pairs = list(itertools.pairwise(widths))
     weights = [torch.randn(out, width, generator=random) / width**0.5 for width, out in pairs]
@@ -70,9 +70,9 @@ def gamma(terms: int) -> float:
 
 
 def bounds(given: Chain, v_output: Tensor) -> tuple[Tensor, list[Tensor], Tensor]:
-    """Rounding error of values and gradients by running the chain on magnitudes (standard forward analysis).
+    """Bounds on the rounding errors of values and gradients (standard forward analysis on magnitudes), and a mask.
 
-    Third: rows no hidden unit of which is so near zero that rounding could switch it.
+    The mask marks rows in which no hidden unit is so near zero that rounding could switch its ReLU.
     """
     levels, errors = [given.inputs], [torch.zeros_like(given.inputs)]
     steady = torch.ones(len(given.inputs), dtype=torch.bool)
@@ -124,22 +124,22 @@ def test_gradcheck_passes() -> None:
 @pytest.mark.parametrize("threads", [2, 3, 8])
 def test_any_number_of_threads_gives_the_same_bits(threads: int) -> None:
     given, v_output = chain(CHAINS[0], 3000).to(torch.float32), upstream(3000, 10)
-    one, many = (differentiate(perceptron, given, v_output, count) for count in (1, threads))
-    assert torch.equal(one[0], many[0])
-    assert all(torch.equal(a, b) for a, b in zip(one[1], many[1], strict=True))
+    single, parallel = (differentiate(perceptron, given, v_output, count) for count in (1, threads))
+    assert torch.equal(single[0], parallel[0])
+    assert all(torch.equal(a, b) for a, b in zip(single[1], parallel[1], strict=True))
 
 
 def in_groups(rows: int, mean: int, width: int) -> GroupBias:
-    """Groups of about `mean` rows, some of none."""
+    """Groups of about `mean` rows; some are empty."""
     random = torch.Generator().manual_seed(rows + mean)
     count = max(1, 2 * rows // mean)
     groups = (torch.rand(rows, generator=random) * count).long().sort().values
     return GroupBias(torch.randn(count, width, generator=random, dtype=torch.float64), groups)
 
 
-@pytest.mark.parametrize("mean", [2, 7, 5000])  # children of an anchor; more than a piece of work holds
+@pytest.mark.parametrize("mean", [2, 7, 5000])  # as children of an anchor; larger than a block of rows
 @pytest.mark.parametrize("rows", [1, 513, 3000])
-def test_what_rows_share_is_added_to_their_first_layer(rows: int, mean: int, isa: str) -> None:
+def test_shared_values_are_added_to_the_first_layer(rows: int, mean: int, isa: str) -> None:
     given, v_output = chain((5, 33, 17, 2), rows), upstream(rows, 2)
     values, groups = in_groups(rows, mean, 33)
     results = []
@@ -161,7 +161,7 @@ def test_shared_values_have_the_same_bits_for_any_number_of_threads() -> None:
     assert torch.equal(*results)
 
 
-def test_groups_out_of_order_or_range_are_refused() -> None:
+def test_groups_out_of_order_or_out_of_range_are_refused() -> None:
     given = chain((4, 6, 3), 3)
     for wrong in ([1, 0, 1], [0, 1, 2], [-1, 0, 0]):
         with pytest.raises(ValueError, match="groups must ascend"):
@@ -180,7 +180,7 @@ def test_groups_out_of_order_or_range_are_refused() -> None:
         )
 
 
-def test_a_row_does_not_see_its_neighbours(isa: str) -> None:
+def test_rows_do_not_influence_each_other(isa: str) -> None:
     given = chain(CHAINS[0], 200).to(torch.float32)
     order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
     values = perceptron(given.inputs, given.weights, given.biases)
@@ -200,9 +200,9 @@ def test_no_rows_give_no_values_and_zero_gradients() -> None:
     assert all(not gradient.any() for gradient in gradients)
 
 
-def test_misuse_is_named() -> None:
+def test_misuse_is_refused_with_its_reason() -> None:
     given = chain((4, 6, 3), 5)
-    with pytest.raises(ValueError, match="layer 1 takes 6 numbers"):
+    with pytest.raises(ValueError, match="layer 1 has 6 inputs"):
         perceptron(given.inputs, [given.weights[0], given.weights[0]], given.biases)
     with pytest.raises(ValueError, match="needs a weight and a bias"):
         perceptron(given.inputs, given.weights, given.biases[:1])
