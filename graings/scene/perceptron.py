@@ -31,13 +31,11 @@ def perceptron(
     biases: Sequence[Float[Tensor, " _"]],
     *,
     shared: GroupBias | None = None,
-    threads: int | None = None,
 ) -> Float[Tensor, "row output"]:
     """W_n relu(... relu(W_1 x + s + b_1) ...) + b_n for each row x; weights are [out, in] as in torch.
 
-    s is the row's bias of `shared`, if given. Differentiable once in all tensors. `threads` is the number of CPU
-    threads (None: the kernel's default); values and gradients have the same bits for any number. Raises `ValueError`
-    for a wrong shape, dtype, device or order of groups.
+    s is the row's bias of `shared`, if given. Differentiable once in all tensors. Values and gradients have the same
+    bits for any number of CPU threads. Raises `ValueError` for a wrong shape, dtype, device or order of groups.
     """
     width, dtype = inputs.shape[-1], inputs.dtype
     if inputs.ndim != 2 or dtype not in (torch.float32, torch.float64):
@@ -63,10 +61,7 @@ def perceptron(
         tensors.append(shared.values)
     if any(t.dtype != dtype or t.device.type != "cpu" for t in tensors):
         raise ValueError(f"inputs, weights, biases and shared values must all be {dtype} on the CPU")
-    workers = kernel.thread_count() if threads is None else threads
-    if workers < 1:
-        raise ValueError(f"threads must be at least 1, got {workers}")
-    values: Tensor = _Perceptron.apply(workers, groups, *tensors)  # type: ignore[no-untyped-call]
+    values: Tensor = _Perceptron.apply(kernel.thread_count(), groups, *tensors)  # type: ignore[no-untyped-call]
     return values
 
 

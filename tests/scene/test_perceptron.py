@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import pytest
 import torch
 from torch import Tensor
 
+from graings import kernel
 from graings.scene.perceptron import GroupBias, perceptron, plain_perceptron
 
 UNIT_ROUNDOFF = 2.0**-24  # float32
@@ -43,14 +45,21 @@ def upstream(rows: int, width: int) -> Tensor:
     return torch.randn(rows, width, generator=torch.Generator().manual_seed(5)).double()
 
 
-def differentiate(
-    function: object, given: Chain, v_output: Tensor, threads: int | None = None
-) -> tuple[Tensor, list[Tensor]]:
+def differentiate(function: Callable[..., Tensor], given: Chain, v_output: Tensor) -> tuple[Tensor, list[Tensor]]:
     leaves = [leaf.clone().requires_grad_() for leaf in given.leaves()]
     depth = len(given.weights)
-    options = {} if threads is None else {"threads": threads}
-    values = function(leaves[0], leaves[1 : depth + 1], leaves[depth + 1 :], **options)  # type: ignore[operator]
+    values = function(leaves[0], leaves[1 : depth + 1], leaves[depth + 1 :])
     return values.detach(), list(torch.autograd.grad(values, leaves, v_output.to(values.dtype)))
+
+
+def with_threads(counts: tuple[int, ...]) -> Iterator[int]:
+    """The counts, each while the kernel uses as many threads."""
+    try:
+        for count in counts:
+            kernel.set_threads(count)
+            yield count
+    finally:
+        kernel.set_threads(None)
 
 
 @pytest.mark.parametrize("widths", CHAINS)
@@ -124,7 +133,7 @@ def test_gradcheck_passes() -> None:
 @pytest.mark.parametrize("threads", [2, 3, 8])
 def test_any_number_of_threads_gives_the_same_bits(threads: int) -> None:
     given, v_output = chain(CHAINS[0], 3000).to(torch.float32), upstream(3000, 10)
-    single, parallel = (differentiate(perceptron, given, v_output, count) for count in (1, threads))
+    single, parallel = (differentiate(perceptron, given, v_output) for _ in with_threads((1, threads)))
     assert torch.equal(single[0], parallel[0])
     assert all(torch.equal(a, b) for a, b in zip(single[1], parallel[1], strict=True))
 
@@ -154,9 +163,9 @@ def test_shared_values_are_added_to_the_first_layer(rows: int, mean: int, isa: s
 def test_shared_values_have_the_same_bits_for_any_number_of_threads() -> None:
     given, (values, groups) = chain((5, 33, 2), 3000).to(torch.float32), in_groups(3000, 7, 33)
     results = []
-    for threads in (1, 3):
+    for _ in with_threads((1, 3)):
         leaf = values.float().requires_grad_()
-        output = perceptron(given.inputs, given.weights, given.biases, shared=GroupBias(leaf, groups), threads=threads)
+        output = perceptron(given.inputs, given.weights, given.biases, shared=GroupBias(leaf, groups))
         results.append(torch.autograd.grad(output.sin().sum(), leaf)[0])
     assert torch.equal(*results)
 
@@ -208,5 +217,3 @@ def test_misuse_is_refused_with_its_reason() -> None:
         perceptron(given.inputs, given.weights, given.biases[:1])
     with pytest.raises(ValueError, match=r"must all be torch\.float64"):
         perceptron(given.inputs, given.weights, [b.float() for b in given.biases])
-    with pytest.raises(ValueError, match="threads must be at least 1"):
-        perceptron(given.inputs, given.weights, given.biases, threads=0)
