@@ -12,7 +12,7 @@ import pytest
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
-from tests.capture.captures import Break, cut, write_colmap
+from tests.capture.captures import Break, cut, pixels, write_colmap, write_image
 
 
 def patch(name: str, at: int, layout: str, *values: float) -> Break:
@@ -121,6 +121,13 @@ def test_broken_text_model_is_refused_with_its_reason(tmp_path: Path, name: str)
 def test_lens_that_cannot_be_undistorted_is_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 1e9, 10.0, 0.1))
     with pytest.raises(CaptureError, match=r"^sparse/0, cameras: the camera SIMPLE_RADIAL .* cannot be undistorted"):
+        load_capture(tmp_path)
+
+
+def test_focal_length_that_overflows_when_scaled_to_the_images_is_refused(tmp_path: Path) -> None:
+    write_colmap(tmp_path, count=1, params=(1.5e308, 1.5e308, 15.5, 10.5))
+    write_image(tmp_path / "images/frame_0000.png", pixels(40, 64, 3))
+    with pytest.raises(CaptureError, match=r"^sparse/0, cameras: intrinsics must be finite"):
         load_capture(tmp_path)
 
 
