@@ -32,3 +32,6 @@ FRUSTUM_MARGIN: Final = 0.3
 
 # Edge of a square raster tile in pixels: 256 pixels are sixteen 4x4 blocks of one AVX-512 register.
 TILE: Final = 16
+
+# Longest side in px of any image that is read or rendered: a larger number is a typo or an attack on memory.
+MAX_IMAGE_SIDE: Final = 16384

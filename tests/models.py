@@ -1,4 +1,4 @@
-"""Tiny scenes for tests: a few anchors with random values, every module awake."""
+"""Tiny scenes for tests: a few anchors with random values, networks with weights as if trained."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ SAMPLING = SamplingRate(extent=1.0, reference=10.0, coarsest=10.0)  # of small t
 
 
 def tiny_scene(
-    *, anchors: int = 20, seed: int = 0, temporal: bool = True, awake: bool = True, **config: object
+    *, anchors: int = 20, seed: int = 0, temporal: bool = True, trained: bool = True, **config: object
 ) -> Scene:
-    """A scene of `anchors` anchors in the unit ball; `awake` gives the zero-born layers random weights."""
+    """A scene of `anchors` anchors in the unit ball; `trained` gives the layers that start at zero random weights."""
     settings = SceneConfig.model_validate(
         {"children": 3, "feature_dim": 8, "head_width": 8, "static_width": 8, "deform_width": 16, "deform_depth": 2}
         | config
@@ -31,10 +31,10 @@ def tiny_scene(
         offsets=torch.randn(anchors, settings.children, 3) * 0.3,
     )
     scene = Scene(settings, scaffold, extent=1.0, sampling=SAMPLING, initial_opacity=0.3)
-    if awake:
+    if trained:
         with torch.no_grad():
-            seeing = None if scene.residual is None else scene.residual.seeing
-            for module in (scene.deformation, scene.residual, seeing):
+            view_dependent = None if scene.residual is None else scene.residual.seeing
+            for module in (scene.deformation, scene.residual, view_dependent, scene.single):
                 if module is not None:
                     module.out.weight.normal_(std=0.1)
                     module.out.bias.normal_(std=0.1)

@@ -1,6 +1,6 @@
-"""Backdrop: the one colour that surrounds what opaque pictures show, if there is one.
+"""Background of opaque images: the colour along the image borders, if nearly all border pixels have the same one.
 
-It is the background then: what has its colour is drawn with nothing. Knows nothing of training.
+Pixels of this colour then count as background, as transparent pixels do.
 """
 
 from __future__ import annotations
@@ -14,45 +14,46 @@ from graings.capture.capture import Capture, Frame
 from graings.capture.images import Image, ImageStore
 from graings.config import CaptureConfig
 
-# Colours that differ by no more than this in any channel are one: compression leaves a few levels of noise.
+# Colours that differ by no more than this in every channel count as equal: compression adds noise of a few levels.
 COLOR_TOLERANCE: Final = 8 / 255
 
-# This share of all edges must be of one colour; what is shown may reach over an edge here and there.
-LEAST_SURROUNDED: Final = 0.9
+# Least fraction of border pixels that must have one colour; objects may reach over the border in places.
+MIN_BORDER_FRACTION: Final = 0.9
 
-# So many pictures are looked at, spread over the clip.
-PICTURES: Final = 8
+# Number of images that are examined, evenly spread over the training images.
+SAMPLED_IMAGES: Final = 8
 
 RGB = tuple[float, float, float]
 
 
 def with_background(config: CaptureConfig, capture: Capture) -> CaptureConfig:
-    """`config` with a colour for `background` where that is left to the pictures of `capture` (auto).
+    """`config` with `background` "auto" replaced by the colour of the image borders of `capture`.
 
-    White where they are transparent around what they show, or have no one colour there. An alpha channel alone says
-    nothing: many files have one that is opaque everywhere. Raises `CaptureError` where a picture cannot be read.
+    White where the borders are transparent or have more than one colour. The mere presence of an alpha channel does
+    not decide, because many files have one that is opaque everywhere. Raises `CaptureError` where an image cannot be
+    read.
     """
     if config.background != "auto":
         return config
     white = config.background_rgb()
-    found = border_color(capture.train, ImageStore(white, config.cache_mb))
-    return config.model_copy(update={"background": "white" if found in (None, white) else found})
+    border = border_color(capture.train, ImageStore(white, config.cache_mb))
+    return config.model_copy(update={"background": "white" if border in (None, white) else border})
 
 
 def border_color(frames: Sequence[Frame], images: ImageStore) -> RGB | None:
-    """The colour of nearly all edges of `frames`, in steps of 1/255; None where they are of more than one.
+    """The colour of nearly all border pixels of `frames`, in steps of 1/255; None where they differ.
 
-    What is transparent has the background of `images`.
+    Transparent pixels count with the background colour of `images`.
     """
-    chosen = np.unique(np.linspace(0, len(frames) - 1, PICTURES).round().astype(int))
-    edges = np.concatenate([_edge(images.rgb(frames[index])) for index in chosen])
-    colour = np.rint(np.median(edges, axis=0).astype(np.float64) * 255) / 255
-    if (np.abs(edges - colour).max(axis=-1) <= COLOR_TOLERANCE).mean() < LEAST_SURROUNDED:
+    sampled = np.unique(np.linspace(0, len(frames) - 1, SAMPLED_IMAGES).round().astype(int))
+    pixels = np.concatenate([_border_pixels(images.rgb(frames[index])) for index in sampled])
+    color = np.rint(np.median(pixels, axis=0).astype(np.float64) * 255) / 255
+    if (np.abs(pixels - color).max(axis=-1) <= COLOR_TOLERANCE).mean() < MIN_BORDER_FRACTION:
         return None
-    red, green, blue = colour.tolist()
+    red, green, blue = color.tolist()
     return red, green, blue
 
 
-def _edge(image: Image) -> Image:
+def _border_pixels(image: Image) -> Image:
     """The outermost pixels [N, 3] of an image [H, W, 3]."""
     return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])

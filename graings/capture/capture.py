@@ -1,7 +1,6 @@
-"""Capture: what cameras saw. Frame: one image with its camera and time.
+"""Capture: images with known cameras and times. Frame: one of these images.
 
-Plain data in normalised units. Knows nothing of file formats (the readers do) or of decoding
-(`graings.capture.images`), and nothing of what is learned from it.
+Plain data in normalised units. Files are read by `graings.capture.readers`, pixels decoded by `graings.capture.images`.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class Frame:
     time: float  # normalised to [0, 1]
     image_path: Path
     source_size: tuple[int, int]  # width, height of the file in pixels
-    lens: Lens | None = None  # how to undistort the file; None: it is a pinhole picture already
+    lens: Lens | None = None  # how to undistort the file; None: it is a pinhole image already
 
     def view(self) -> View:
         """The frame without its image."""
@@ -58,8 +57,8 @@ class Capture:
     units: Units
     has_alpha: bool  # some image carries an alpha channel
     points: PointCloud | None = None
-    notes: tuple[str, ...] = field(default=())  # what the reader left out or assumed, in words
-    content_hash: str = ""  # sha256 over the files that were read, independent of the folder's place
+    notes: tuple[str, ...] = field(default=())  # what the reader skipped or assumed, as sentences
+    content_hash: str = ""  # sha256 over the files that were read, independent of the folder's path
 
     def split(self, name: Split) -> tuple[Frame, ...]:
         """Frames of one split."""

@@ -1,7 +1,7 @@
-"""CaptureFolder: the only door through which readers reach files of a capture.
+"""CaptureFolder: all access of the readers to files of a capture.
 
-It refuses every path that leads outside, checks that images are whole, and remembers what was read, so that
-the capture gets a hash that does not depend on where it lies. Knows nothing of cameras, times or splits.
+It refuses every path that leads outside, checks that images are complete, and records what was read, so that the
+capture gets a hash that does not depend on its path.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ class CaptureFolder:
         self._images: dict[str, ImageFile] = {}
 
     def locate(self, name: str, *, source: str, field: str | None = None) -> Path:
-        """The path of `name`, whether it exists or not; `source` and `field` say who asked for it.
+        """The path of `name`, whether it exists or not; `source` and `field` are where the capture names it.
 
         Raises `CaptureError` where the name, or a link on its way, leads outside the capture.
         """
         try:
             path = self.root / name
             outside = Path(name).is_absolute() or not path.resolve().is_relative_to(self.root)
-            path.is_file()  # raises for what no file can be called, and for what may not be looked at
+            path.is_file()  # raises for impossible names and for missing permissions
         except (OSError, ValueError, RuntimeError) as error:  # a NUL byte, a name too long, a loop of links
             raise CaptureError(
                 f"cannot use the path {name[:80]!r} ({getattr(error, 'strerror', None) or error})",
@@ -65,9 +65,9 @@ class CaptureFolder:
         return data
 
     def image(self, name: str, *, source: str, field: str | None = None) -> ImageFile:
-        """The image `name`, which may lack its extension; checked to be whole, not decoded.
+        """The image `name`, which may lack its extension; checked to be complete, not decoded.
 
-        Raises `CaptureError` where it is missing, truncated, too large or in no format that is read.
+        Raises `CaptureError` where it is missing, truncated, too large or in an unsupported format.
         """
         candidates = [name, *(name + suffix for suffix in SUFFIXES)]
         for candidate in candidates:
@@ -80,10 +80,10 @@ class CaptureFolder:
                     self._images[relative] = check_image(path, relative, self.read(relative))
                 return self._images[relative]
         raise CaptureError(
-            f"the image {name!r} is missing (tried as it is and with {', '.join(SUFFIXES)})",
+            f"the image {name!r} is missing (tried without and with the extensions {', '.join(SUFFIXES)})",
             file=source,
             field=field,
-            remedy="Add the image or take its entry out.",
+            remedy="Add the image or remove its entry.",
         )
 
     def digest(self) -> str:

@@ -1,7 +1,7 @@
-"""ImageFile: one image on disk: is it whole, how large is it, what are its pixels.
+"""ImageFile: one image on disk, checked for completeness and size, and its pixels.
 
-PNG, JPEG and OpenEXR, told apart by content, not by name. Stored values are taken as they are: 8 bit as x/255,
-16 bit as x/65535, EXR floats clipped to [0, 1] with no transfer curve. Knows nothing of cameras or sizes wanted.
+PNG, JPEG and OpenEXR, recognised by content, not by name. Stored values are not converted: 8 bit as x/255, 16 bit as
+x/65535, EXR floats clipped to [0, 1] without a transfer curve.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
+from graings.constants import MAX_IMAGE_SIDE
 from graings.errors import CaptureError
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 
-# A few kilobytes of PNG can announce any size: more than this is refused before anything is decoded.
-MAX_SIDE: Final = 16384
+# A PNG of a few kilobytes can declare any size: larger images are refused before they are decoded.
 MAX_PIXELS: Final = 2**26  # 1 GB as RGBA float32
 
-PNG: Final = b"\x89PNG\r\n\x1a\n"
-JPEG: Final = b"\xff\xd8\xff"
-EXR: Final = b"\x76\x2f\x31\x01"
+PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+JPEG_SIGNATURE: Final = b"\xff\xd8\xff"
+EXR_SIGNATURE: Final = b"\x76\x2f\x31\x01"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,28 +40,29 @@ class ImageFile:
 
 
 def check_image(path: Path, name: str, data: bytes) -> ImageFile:
-    """Header of the image at `path` whose contents are `data`.
+    """The header of the image at `path` whose contents are `data`, after a check that it is complete.
 
-    PNG chunks and JPEG segments are walked to their end mark (decoders fill a truncated JPEG with grey and say
-    nothing); EXR has no end mark and is decoded once. Raises `CaptureError` for anything that is not whole.
+    PNG chunks and JPEG segments are followed to their end marker, because decoders fill a truncated JPEG with grey
+    without an error; EXR has no end marker and is decoded once. Raises `CaptureError` for truncated, damaged, too large
+    and unsupported images.
     """
-    if data.startswith(PNG):
-        whole = _png_is_whole(data)
-    elif data.startswith(JPEG):
-        whole = _jpeg_is_whole(data)
-    elif data.startswith(EXR):
-        whole = True
+    if data.startswith(PNG_SIGNATURE):
+        complete = _png_is_complete(data)
+    elif data.startswith(JPEG_SIGNATURE):
+        complete = _jpeg_is_complete(data)
+    elif data.startswith(EXR_SIGNATURE):
+        complete = True
     elif not data:
-        whole = False
+        complete = False
     else:
         raise CaptureError("is no PNG, JPEG or OpenEXR image", file=name, remedy="Convert it to one of these.")
-    if not whole:
-        raise _broken(name, "is truncated or damaged")
+    if not complete:
+        raise _damaged(name, "is truncated or damaged")
     source = _open(path, name)
     spec = source.spec()
     source.close()
     image = ImageFile(path, name, spec.width, spec.height, _channels(spec, name)[1] is not None)
-    if data.startswith(EXR):
+    if data.startswith(EXR_SIGNATURE):
         decode(path, name)
     return image
 
@@ -76,10 +77,10 @@ def decode(path: Path, name: str) -> NDArray[np.float32]:
     color, alpha = _channels(spec, name)
     stored = source.read_image(0, 0, 0, spec.nchannels, spec.format)
     problem = source.geterror()
-    premultiplied = source.format_name() == "openexr"  # by its standard; PNG alpha is straight
+    premultiplied = source.format_name() == "openexr"  # as its standard requires; alpha of PNG is straight
     source.close()
     if stored is None or problem:
-        raise _broken(name, f"cannot be decoded ({' '.join(problem.split())})")
+        raise _damaged(name, f"cannot be decoded ({' '.join(problem.split())})")
     stored = np.asarray(stored).reshape(spec.height, spec.width, spec.nchannels)
     pixels = stored[..., color if alpha is None else [*color, alpha]].astype(np.float32)
     if np.issubdtype(stored.dtype, np.integer):
@@ -94,16 +95,16 @@ def decode(path: Path, name: str) -> NDArray[np.float32]:
 
 
 def _open(path: Path, name: str) -> oiio.ImageInput:
-    # OpenImageIO premultiplies PNG colours in 8 bit unless told not to, which loses the dark ones.
-    wanted = oiio.ImageSpec()
-    wanted["oiio:UnassociatedAlpha"] = 1
-    source = oiio.ImageInput.open(str(path), wanted)
+    # Without this option OpenImageIO premultiplies PNG colours in 8 bit, which rounds dark ones to black.
+    options = oiio.ImageSpec()
+    options["oiio:UnassociatedAlpha"] = 1
+    source = oiio.ImageInput.open(str(path), options)
     if source is None:
-        raise _broken(name, f"cannot be opened ({' '.join(oiio.geterror().split())})")
+        raise _damaged(name, f"cannot be opened ({' '.join(oiio.geterror().split())})")
     spec = source.spec()
-    if max(spec.width, spec.height) > MAX_SIDE or spec.width * spec.height > MAX_PIXELS:
+    if max(spec.width, spec.height) > MAX_IMAGE_SIDE or spec.width * spec.height > MAX_PIXELS:
         raise CaptureError(
-            f"is {spec.width}x{spec.height} px; at most {MAX_SIDE} px a side and {MAX_PIXELS} px in all are read",
+            f"is {spec.width}x{spec.height} px, more than {MAX_IMAGE_SIDE} px per side or {MAX_PIXELS} px in total",
             file=name,
             field="size",
             remedy="Scale the images down.",
@@ -112,7 +113,7 @@ def _open(path: Path, name: str) -> oiio.ImageInput:
         raise CaptureError("is a deep or volume image", file=name, remedy="Flatten it.")
     if (spec.x, spec.y, spec.full_width, spec.full_height) != (0, 0, spec.width, spec.height):
         raise CaptureError(
-            "stores a part of its frame only (data window differs from display window)",
+            "contains only a part of its frame (data window differs from display window)",
             file=name,
             field="size",
             remedy="Export the full frame.",
@@ -132,12 +133,12 @@ def _channels(spec: oiio.ImageSpec, name: str) -> tuple[list[int], int | None]:
         f"has the channels {', '.join(names)}",
         file=name,
         field="channels",
-        remedy="Grey or RGB, with or without alpha, are read.",
+        remedy="Export it as grey or RGB, with or without alpha.",
     )
 
 
-def _png_is_whole(data: bytes) -> bool:
-    at = len(PNG)
+def _png_is_complete(data: bytes) -> bool:
+    at = len(PNG_SIGNATURE)
     view = memoryview(data)
     while at + 12 <= len(data):
         size = int.from_bytes(view[at : at + 4], "big")
@@ -150,18 +151,18 @@ def _png_is_whole(data: bytes) -> bool:
     return False
 
 
-def _jpeg_is_whole(data: bytes) -> bool:
+def _jpeg_is_complete(data: bytes) -> bool:
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         if data[at + 1] == 0xFF:  # fill byte
             at += 1
             continue
         end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-        if data[at + 1] == 0xDA:  # start of scan: coded data holds no bare marker, so the first end mark is the end
+        if data[at + 1] == 0xDA:  # start of scan: coded data contains no marker, so the next end marker is the end
             return data.find(b"\xff\xd9", end) >= 0
         at = end
     return False
 
 
-def _broken(name: str, problem: str) -> CaptureError:
+def _damaged(name: str, problem: str) -> CaptureError:
     return CaptureError(problem, file=name, remedy="Copy or export the image again.")

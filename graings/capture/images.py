@@ -1,8 +1,8 @@
-"""ImageStore: pixels of frames, decoded when asked for, kept in a bounded cache.
+"""ImageStore: pixels of frames, decoded on demand and held in a bounded cache.
 
-Decode, undistort, shrink by exact area average on premultiplied alpha, composite on the background. Kept as 16-bit
-numbers, half the memory of float32; rounding costs at most 0.002 levels of 255, and nothing for opaque pixels of 8 or
-16 bits at their own size. Knows nothing of splits, poses or training.
+Decode, undistort, shrink by exact area average on premultiplied alpha, composite on the background. The cache holds
+16-bit integers, half the memory of float32; rounding changes a value by at most 0.002 levels of 255, and opaque pixels
+of 8 or 16 bits at their original size not at all.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from graings.capture.image_file import decode
 from graings.errors import CaptureError
 
 Image = NDArray[np.float32]
-Kept = NDArray[np.uint16]
-Picture = tuple[Path, int, int]
-Key = tuple[Path, int, int, str]
+Quantized = NDArray[np.uint16]
+ImageKey = tuple[Path, int, int]  # file, width and height after shrinking
+PartKey = tuple[Path, int, int, str]  # as above, and "rgb" or "alpha"
 
-STEPS: Final = np.float32(65535)  # of what is kept, from 0 to 1
+LEVELS: Final = np.float32(65535)  # the quantized value of 1
 
 
 class ImageStore:
@@ -34,63 +34,63 @@ class ImageStore:
 
     def __init__(self, background: Sequence[float], cache_mb: int = 1024) -> None:
         self._background = np.asarray(background, dtype=np.float32).reshape(3)
-        self._kept_background = _kept(self._background)
-        self._between_steps = bool((_shown(self._kept_background) != self._background).any())
+        self._quantized_background = _quantize(self._background)
+        self._background_is_rounded = bool((_dequantize(self._quantized_background) != self._background).any())
         self._limit = cache_mb * 1_000_000
         self._lock = threading.Lock()
-        self._cache: OrderedDict[Key, Kept | None] = OrderedDict()
+        self._cache: OrderedDict[PartKey, Quantized | None] = OrderedDict()
         self._bytes = 0
-        self._ahead = ThreadPoolExecutor(1, "decoder")
-        self._coming: dict[Picture, Future[tuple[Kept, Kept | None]]] = {}
+        self._prefetcher = ThreadPoolExecutor(1, "decoder")
+        self._pending: dict[ImageKey, Future[tuple[Quantized, Quantized | None]]] = {}
 
     def prefetch(self, frame: Frame) -> None:
-        """Begin to decode a frame that is wanted next, on another thread; who asks for it is told what went wrong."""
-        picture = _picture(frame)
+        """Start decoding `frame` on another thread; an error is raised by the next `rgb` or `alpha` of the frame."""
+        key = _image_key(frame)
         with self._lock:
-            if (*picture, "rgb") not in self._cache and picture not in self._coming:
-                self._coming[picture] = self._ahead.submit(self._load, frame)
+            if (*key, "rgb") not in self._cache and key not in self._pending:
+                self._pending[key] = self._prefetcher.submit(self._load, frame)
 
     def rgb(self, frame: Frame) -> Image:
         """Colour [H, W, 3] in [0, 1] on the background, at the size of the frame's camera, in steps of 1/65535.
 
-        Raises `CaptureError` where the file has changed or broken since the capture was loaded.
+        Raises `CaptureError` where the file has changed or was damaged since the capture was loaded.
         """
-        kept = self._get(frame, "rgb")
-        assert kept is not None  # only alpha may be absent
-        image = _shown(kept)
-        if self._between_steps:  # nothing in sight has the very colour of a render in which nothing is drawn
-            np.copyto(image, self._background, where=kept == self._kept_background)
+        quantized = self._get(frame, "rgb")
+        assert quantized is not None  # only alpha may be absent
+        image = _dequantize(quantized)
+        if self._background_is_rounded:  # background pixels must equal those of a render without Gaussians exactly
+            np.copyto(image, self._background, where=quantized == self._quantized_background)
         return image
 
     def alpha(self, frame: Frame) -> Image | None:
-        """Coverage [H, W] in [0, 1] at the size of the frame's camera; None where nothing is said to be transparent.
+        """Alpha [H, W] in [0, 1] at the size of the frame's camera; None without an alpha channel.
 
-        Many files have an alpha channel that is opaque everywhere, and mean no more by it than those without one.
+        A channel that is opaque everywhere counts as none: many programs write one by default.
         """
-        kept = self._get(frame, "alpha")
-        return None if kept is None else _shown(kept)
+        quantized = self._get(frame, "alpha")
+        return None if quantized is None else _dequantize(quantized)
 
     @property
     def cached_bytes(self) -> int:
-        """Memory the cached arrays take."""
+        """Memory of the cached arrays in bytes."""
         return self._bytes
 
-    def _get(self, frame: Frame, part: str) -> Kept | None:
-        picture = _picture(frame)
-        key = (*picture, part)
+    def _get(self, frame: Frame, part: str) -> Quantized | None:
+        key = _image_key(frame)
+        part_key = (*key, part)
         with self._lock:
-            coming = self._coming.pop(picture, None)
-            if key in self._cache:
-                self._cache.move_to_end(key)
-                return self._cache[key]
-        # Outside the lock: threads decode side by side; two asking for the same frame do the work twice, rarely.
-        rgb, alpha = self._load(frame) if coming is None else coming.result()
+            pending = self._pending.pop(key, None)
+            if part_key in self._cache:
+                self._cache.move_to_end(part_key)
+                return self._cache[part_key]
+        # Outside the lock, so that threads decode in parallel; rarely two threads decode the same frame.
+        rgb, alpha = self._load(frame) if pending is None else pending.result()
         with self._lock:
-            self._keep((*picture, "alpha"), alpha)
-            self._keep((*picture, "rgb"), rgb)
+            self._add_to_cache((*key, "alpha"), alpha)
+            self._add_to_cache((*key, "rgb"), rgb)
         return rgb if part == "rgb" else alpha
 
-    def _keep(self, key: Key, image: Kept | None) -> None:
+    def _add_to_cache(self, key: PartKey, image: Quantized | None) -> None:
         if key in self._cache:
             return
         self._cache[key] = image
@@ -99,7 +99,7 @@ class ImageStore:
             _, dropped = self._cache.popitem(last=False)
             self._bytes -= 0 if dropped is None else dropped.nbytes
 
-    def _load(self, frame: Frame) -> tuple[Kept, Kept | None]:
+    def _load(self, frame: Frame) -> tuple[Quantized, Quantized | None]:
         pixels = decode(frame.image_path, frame.name)
         if (pixels.shape[1], pixels.shape[0]) != frame.source_size:
             raise CaptureError(
@@ -112,27 +112,28 @@ class ImageStore:
             pixels = frame.lens.undistort(pixels)
         pixels = shrink(pixels, frame.camera.width, frame.camera.height)
         if pixels.shape[2] == 3:
-            return _kept(pixels), None
+            return _quantize(pixels), None
         alpha = pixels[..., 3]
         rgb = pixels[..., :3] + self._background * (1.0 - alpha)[..., None]
-        coverage = _kept(alpha)
-        return _kept(np.minimum(rgb, np.float32(1.0))), None if (coverage == STEPS).all() else coverage
+        quantized_alpha = _quantize(alpha)
+        opaque = (quantized_alpha == LEVELS).all()
+        return _quantize(np.minimum(rgb, np.float32(1.0))), None if opaque else quantized_alpha
 
 
-def _kept(image: Image) -> Kept:
-    return np.ascontiguousarray(np.rint(image * STEPS).astype(np.uint16))
+def _quantize(image: Image) -> Quantized:
+    return np.ascontiguousarray(np.rint(image * LEVELS).astype(np.uint16))
 
 
-def _shown(kept: Kept) -> Image:
-    return np.divide(kept, STEPS, dtype=np.float32)
+def _dequantize(quantized: Quantized) -> Image:
+    return np.divide(quantized, LEVELS, dtype=np.float32)
 
 
-def _picture(frame: Frame) -> Picture:
+def _image_key(frame: Frame) -> ImageKey:
     return frame.image_path, frame.camera.width, frame.camera.height
 
 
 def shrink(image: Image, width: int, height: int) -> Image:
-    """`image` [H, W, C] averaged over the areas of `height` x `width` equal cells, whatever the ratio."""
+    """`image` [H, W, C] averaged over `height` x `width` equal cells; the ratio of sizes need not be whole."""
     if image.shape[:2] == (height, width):
         return image
     if image.shape[0] % height == 0 and image.shape[1] % width == 0:
@@ -141,7 +142,7 @@ def shrink(image: Image, width: int, height: int) -> Image:
 
 
 def _block_means(image: Image, rows: int, columns: int) -> Image:
-    """Whole pixels to a cell, as in most captures: plain sums are several times as fast."""
+    """Means of cells of `rows` x `columns` whole pixels, the common case: plain sums are several times faster."""
     total = np.zeros(image[::rows, ::columns].shape)
     for row in range(rows):
         for column in range(columns):
@@ -154,7 +155,7 @@ def _cell_means(values: NDArray[np.floating], cells: int, axis: int) -> NDArray[
     edges = np.arange(cells + 1) * size / cells
     first = np.minimum(edges[:-1].astype(np.intp), size - 1)
     total = np.zeros(1)
-    # The k-th pixel of every cell at once: few steps on long arrays, in float64 so that rounding stays below float32's.
+    # The k-th pixel of all cells at once: few operations on long arrays, in float64 to round to float32 only once.
     for pixel in range(int(np.ceil(edges[1:] - first).max())):
         index = first + pixel
         overlap = np.minimum(edges[1:], index + 1) - np.maximum(edges[:-1], index)

@@ -1,7 +1,4 @@
-"""load_capture: which reader fits a folder, and its result in normalised units.
-
-Knows the readers and nothing of the formats they read.
-"""
+"""load_capture: chooses the reader for a folder and returns its capture in normalised units."""
 
 from __future__ import annotations
 
@@ -23,23 +20,23 @@ Reader = Callable[[CaptureFolder, CaptureConfig], RawCapture]
 def load_capture(path: Path, config: CaptureConfig | None = None) -> Capture:
     """The capture in the folder `path`, or in its only sub-folder that holds one.
 
-    `transforms_*.json` is preferred over a COLMAP model where both lie there, and that over a lone `transforms.json`.
-    Images are checked to be whole but not decoded (EXR excepted). Raises `CaptureError` naming file, field and remedy.
+    `transforms_*.json` is preferred over a COLMAP model where both exist, and a COLMAP model over `transforms.json`.
+    Images are checked to be complete but not decoded (except EXR). Raises `CaptureError` naming file, field and remedy.
     """
     config = config or CaptureConfig()
     if not path.is_dir():
         raise CaptureError("is not a folder", file=path, remedy="Give the folder of a capture; unpack archives first.")
-    found = _reader(path)
-    if found is None:
+    reader = _reader(path)
+    if reader is None:
         inner = [child for child in sorted(path.iterdir()) if _is_inner(child) and _reader(child)]
         if len(inner) != 1:
             raise _not_found(path, inner)
         path = inner[0]
-        found = _reader(path)
-    assert found is not None  # an inner folder is taken only where a reader fits
+        reader = _reader(path)
+    assert reader is not None  # `inner` lists only folders with a reader
     folder = CaptureFolder(path)
-    recording = found(folder, config)
-    return normalize(recording, root=path, max_side=config.max_side, content_hash=folder.digest())
+    raw = reader(folder, config)
+    return normalize(raw, root=path, max_side=config.max_side, content_hash=folder.digest())
 
 
 def _reader(path: Path) -> Reader | None:
@@ -53,17 +50,17 @@ def _reader(path: Path) -> Reader | None:
 
 
 def _is_inner(path: Path) -> bool:
-    # A link could lead out of an unpacked archive; __MACOSX holds the ghosts of files.
+    # A link could lead out of an unpacked archive; __MACOSX holds only metadata of archives made on macOS.
     return path.is_dir() and not path.is_symlink() and not path.name.startswith((".", "__MACOSX"))
 
 
 def _not_found(path: Path, inner: list[Path]) -> CaptureError:
     if inner:
         names = ", ".join(child.name for child in inner)
-        return CaptureError(f"holds several captures ({names})", file=path, remedy="Give one of them.")
+        return CaptureError(f"contains several captures ({names})", file=path, remedy="Give the folder of one of them.")
     return CaptureError(
-        "holds no capture: neither transforms_train.json (D-NeRF, NeRF-synthetic) nor transforms.json (nerfstudio) nor "
-        "a COLMAP model (cameras, images and points3D as .bin or .txt in sparse/0, sparse or the folder itself)",
+        "contains no capture: neither transforms_train.json (D-NeRF, NeRF-synthetic) nor transforms.json (nerfstudio) "
+        "nor a COLMAP model (cameras, images and points3D as .bin or .txt in sparse/0, sparse or the folder itself)",
         file=path,
-        remedy="Give the folder that holds one of them.",
+        remedy="Give a folder that contains one of them.",
     )

@@ -1,7 +1,7 @@
-"""Normalisation: one change of units for a whole capture, in float64, before anything is learned.
+"""Normalisation: one change of units for a whole capture, in float64, before training.
 
-Lengths: centred on what the cameras look at, scaled by a power of two to about 1. Times: mapped to [0, 1] over all
-splits. Knows nothing of file formats.
+Lengths: centred on the point at which the cameras look, scaled by a power of two to about 1. Times: mapped to [0, 1]
+over all splits.
 """
 
 from __future__ import annotations
@@ -16,57 +16,67 @@ from numpy.typing import NDArray
 from graings.camera.camera import Camera
 from graings.camera.units import Units
 from graings.capture.capture import SPLITS, Capture, Frame, PointCloud
-from graings.capture.raw_capture import MAX_DISTANCE, RawCapture, RawFrame
+from graings.capture.raw_capture import MAX_MAGNITUDE, RawCapture, RawFrame
 from graings.errors import CaptureError
 
 Array = NDArray[np.float64]
 
-# Focal lengths and distances of the principal point beyond these, in picture sizes, are slips of the file.
-SHORTEST, LONGEST, OFF_AXIS = 1e-3, 1e6, 1e3
+# Focal lengths and principal points outside these bounds, in image sizes, are errors of the file.
+MIN_FOCAL_LENGTH, MAX_FOCAL_LENGTH, MAX_PRINCIPAL_POINT = 1e-3, 1e6, 1e3
 
-# Time stamps closer than this share of the whole range are one instant.
-SAME_INSTANT = 1e-6
+# Times that differ by no more than this fraction of the whole range are one instant.
+TIME_TOLERANCE = 1e-6
 
 # Mean squared sine between optical axes below which they count as parallel (about half a degree).
-PARALLEL = 1e-4
+PARALLEL_SINE_SQUARED = 1e-4
 
-# A vertical axis this close to a world axis (cos 10 degrees) is meant to be that axis.
-NEARLY_AXIS = math.cos(math.radians(10.0))
+# An up axis within 10 degrees of a world axis is replaced by it: captures are almost always levelled to their world.
+SNAP_COSINE = math.cos(math.radians(10.0))
+
+# The right axes of the cameras lie in a plane if their second moment across it is below this fraction of the next one.
+PLANAR_RATIO = 0.05
+
+# Distances below this, in the capture's unit, count as zero.
+MIN_DISTANCE = 1e-12
 
 
-def normalize(recording: RawCapture, *, root: Path, max_side: int | None, content_hash: str) -> Capture:
-    """The capture in normalised units, its cameras reduced to `max_side` px."""
-    notes = list(recording.notes)
-    shots = [shot for split in SPLITS for shot in recording.splits[split]]
-    for shot in shots:
-        for field, size in (("camera position", np.abs(shot.camera.center).max()), ("time", abs(shot.time or 0.0))):
-            if size > MAX_DISTANCE:
+def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash: str) -> Capture:
+    """The capture in normalised units, with cameras downscaled to at most `max_side` px.
+
+    Raises `CaptureError` naming the image whose camera or time has an impossible value.
+    """
+    notes = list(raw.notes)
+    raw_frames = [raw_frame for split in SPLITS for raw_frame in raw.splits[split]]
+    for raw_frame in raw_frames:
+        position, time = np.abs(raw_frame.camera.center).max(), abs(raw_frame.time or 0.0)
+        for field, magnitude in (("camera position", position), ("time", time)):
+            if magnitude > MAX_MAGNITUDE:
                 raise CaptureError(
-                    f"is {size:.3g}; nothing beyond {MAX_DISTANCE:g} is taken",
-                    file=shot.image.name,
+                    f"is {magnitude:.3g}, beyond the limit of {MAX_MAGNITUDE:g}",
+                    file=raw_frame.image.name,
                     field=field,
                     remedy="Correct it in the file that lists the image.",
                 )
-        _check_lens(shot)
-    cameras = [shot.camera for shot in recording.splits["train"]]
-    center, scale, found = frame_of_reference(cameras, recording.positions)
-    notes += found
-    instants = _instants([shot.time for shot in shots if shot.time is not None])
-    stamps = sorted(set(instants.values()))
-    if not stamps:
-        notes.append("no times: the scene is taken to be static")
-    elif len(stamps) == 1:
-        notes.append("all frames share one time: the scene is taken to be static")
+        _check_intrinsics(raw_frame)
+    cameras = [raw_frame.camera for raw_frame in raw.splits["train"]]
+    center, scale, assumptions = center_and_scale(cameras, raw.positions)
+    notes += assumptions
+    instants = _merged_times([raw_frame.time for raw_frame in raw_frames if raw_frame.time is not None])
+    times = sorted(set(instants.values()))
+    if not times:
+        notes.append("no times: the scene is assumed to be static")
+    elif len(times) == 1:
+        notes.append("all frames share one time: the scene is assumed to be static")
     units = Units(
         center=(float(center[0]), float(center[1]), float(center[2])),
         scale=scale,
-        time_start=stamps[0] if stamps else 0.0,
-        time_span=stamps[-1] - stamps[0] if stamps else 0.0,
-        up=vertical(cameras),
+        time_start=times[0] if times else 0.0,
+        time_span=times[-1] - times[0] if times else 0.0,
+        up=up_axis(cameras),
     )
 
-    def frame(shot: RawFrame) -> Frame:
-        source = shot.camera
+    def normalized(raw_frame: RawFrame) -> Frame:
+        source = raw_frame.camera
         camera = Camera(
             units.camera(source.world_to_camera),
             source.fx,
@@ -77,54 +87,54 @@ def normalize(recording: RawCapture, *, root: Path, max_side: int | None, conten
             source.height,
         )
         return Frame(
-            name=shot.image.name,
-            camera=_at_most(camera, max_side),
-            time=0.0 if shot.time is None else units.time(instants[shot.time]),
-            image_path=shot.image.path,
-            source_size=(shot.image.width, shot.image.height),
-            lens=shot.lens,
+            name=raw_frame.image.name,
+            camera=_downscaled(camera, max_side),
+            time=0.0 if raw_frame.time is None else units.time(instants[raw_frame.time]),
+            image_path=raw_frame.image.path,
+            source_size=(raw_frame.image.width, raw_frame.image.height),
+            lens=raw_frame.lens,
         )
 
-    splits = {split: tuple(frame(shot) for shot in recording.splits[split]) for split in SPLITS}
+    splits = {split: tuple(normalized(raw_frame) for raw_frame in raw.splits[split]) for split in SPLITS}
     points = None
-    if recording.positions is not None and recording.colors is not None:
-        points = PointCloud(units.points(recording.positions), recording.colors)
+    if raw.positions is not None and raw.colors is not None:
+        points = PointCloud(units.points(raw.positions), raw.colors)
     return Capture(
         root=root,
-        kind=recording.kind,
+        kind=raw.kind,
         train=splits["train"],
         val=splits["val"],
         test=splits["test"],
         units=units,
-        has_alpha=any(shot.image.has_alpha for shot in shots),
+        has_alpha=any(raw_frame.image.has_alpha for raw_frame in raw_frames),
         points=points,
         notes=tuple(notes),
         content_hash=content_hash,
     )
 
 
-def _check_lens(shot: RawFrame) -> None:
-    """Raises `CaptureError` for a camera whose picture no rounding would survive."""
-    camera = shot.camera
-    for across, focal, middle, size in (
+def _check_intrinsics(raw_frame: RawFrame) -> None:
+    """Raises `CaptureError` for intrinsics with which projections would be dominated by rounding errors."""
+    camera = raw_frame.camera
+    for axis, focal, principal, size in (
         ("x", camera.fx, camera.cx, camera.width),
         ("y", camera.fy, camera.cy, camera.height),
     ):
-        if not SHORTEST <= focal / size <= LONGEST:
-            problem = f"is {focal / size:.3g} picture sizes; from {SHORTEST:g} to {LONGEST:g} are taken"
-            field = f"focal length f{across}"
-        elif abs(middle) / size > OFF_AXIS:
-            problem = f"is {middle / size:.3g} picture sizes; nothing beyond {OFF_AXIS:g} is taken"
-            field = f"principal point c{across}"
+        if not MIN_FOCAL_LENGTH <= focal / size <= MAX_FOCAL_LENGTH:
+            limits = f"outside {MIN_FOCAL_LENGTH:g} to {MAX_FOCAL_LENGTH:g}"
+            problem, field = f"is {focal / size:.3g} image sizes, {limits}", f"focal length f{axis}"
+        elif abs(principal) / size > MAX_PRINCIPAL_POINT:
+            limits = f"beyond the limit of {MAX_PRINCIPAL_POINT:g}"
+            problem, field = f"is {principal / size:.3g} image sizes, {limits}", f"principal point c{axis}"
         else:
             continue
         raise CaptureError(
-            problem, file=shot.image.name, field=field, remedy="Correct it in the file that holds the camera."
+            problem, file=raw_frame.image.name, field=field, remedy="Correct it in the file that lists the camera."
         )
 
 
-def frame_of_reference(cameras: Sequence[Camera], points: Array | None) -> tuple[Array, float, list[str]]:
-    """Centre [3] and power-of-two scale of a capture, and what had to be assumed.
+def center_and_scale(cameras: Sequence[Camera], points: Array | None) -> tuple[Array, float, list[str]]:
+    """Centre [3] and power-of-two scale of a capture, and notes on assumptions.
 
     Centre: median of `points` [M, 3], or the point nearest to all optical axes. Radius: 90th percentile of the
     distances of points or cameras from it, whichever is larger.
@@ -135,75 +145,76 @@ def frame_of_reference(cameras: Sequence[Camera], points: Array | None) -> tuple
         center = np.median(points, axis=0)
         radius = float(np.percentile(np.linalg.norm(points - center, axis=1), 90))
     else:
-        center, note = _look_at(cameras, centers)
-        notes += note
+        center, assumptions = _point_of_interest(cameras, centers)
+        notes += assumptions
         radius = 0.0
     radius = max(radius, float(np.percentile(np.linalg.norm(centers - center, axis=1), 90)))
-    if radius < 1e-12:
+    if radius < MIN_DISTANCE:
         radius = 1.0
-    # Nearest power of two to 1 / radius by exponent arithmetic: rounding a logarithm could break a tie
-    # differently for a capture scaled by 2^k, which must come out with the same bits.
+    # Nearest power of two to 1 / radius by exponent arithmetic: a rounded logarithm could break a tie differently for
+    # the same capture scaled by 2^k, whose normalised numbers must have the same bits.
     mantissa, exponent = math.frexp(radius)
     return center, math.ldexp(1.0, int(mantissa < math.sqrt(0.5)) - exponent), notes
 
 
-def vertical(cameras: Sequence[Camera]) -> tuple[float, float, float]:
-    """The capture's up axis, unit length: perpendicular to all horizons where these agree, else the mean camera up."""
+def up_axis(cameras: Sequence[Camera]) -> tuple[float, float, float]:
+    """Unit up axis of the capture: normal to the right axes of the cameras if these are coplanar, else the mean up."""
     mean = np.mean([-camera.world_to_camera[1, :3] for camera in cameras], axis=0)
     rights = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
     values, vectors = np.linalg.eigh(rights.T @ rights / len(cameras))
-    # Level cameras have right axes in one plane; a camera looking steeply down has an up axis far off the vertical,
-    # so its horizon says more. One camera, or cameras rolled at will, leave only the mean.
-    axis = vectors[:, 0] if values[0] < 0.05 * values[1] else mean
+    # Right axes of level cameras are horizontal at any elevation, whereas the up axis of a camera that looks down is
+    # far from vertical. With one camera, or with cameras rolled arbitrarily, only the mean is defined.
+    axis = vectors[:, 0] if values[0] < PLANAR_RATIO * values[1] else mean
     if axis @ mean < 0:
         axis = -axis
     length = float(np.linalg.norm(axis))
     if length < 1e-6:
         return (0.0, 0.0, 1.0)
     axis = axis / length
-    main = int(np.argmax(np.abs(axis)))
-    if abs(axis[main]) > NEARLY_AXIS:
-        axis = np.sign(axis[main]) * np.eye(3)[main]
+    nearest = int(np.argmax(np.abs(axis)))
+    if abs(axis[nearest]) > SNAP_COSINE:
+        axis = np.sign(axis[nearest]) * np.eye(3)[nearest]
     return (float(axis[0]), float(axis[1]), float(axis[2]))
 
 
-def _look_at(cameras: Sequence[Camera], centers: Array) -> tuple[Array, list[str]]:
+def _point_of_interest(cameras: Sequence[Camera], centers: Array) -> tuple[Array, list[str]]:
+    """The point [3] with the least squared distances from all optical axes, and notes on assumptions."""
     axes = np.stack([camera.forward for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # distance from an axis, as a projection
+    projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # onto the planes perpendicular to each axis
     middle = np.median(centers, axis=0)
-    if float(np.linalg.eigvalsh(across.mean(axis=0))[0]) > PARALLEL:
-        right_hand = np.einsum("nij,nj->i", across, centers - middle) / len(cameras)
-        center = middle + np.linalg.solve(across.mean(axis=0), right_hand)
+    if float(np.linalg.eigvalsh(projections.mean(axis=0))[0]) > PARALLEL_SINE_SQUARED:
+        right_hand_side = np.einsum("nij,nj->i", projections, centers - middle) / len(cameras)
+        center = middle + np.linalg.solve(projections.mean(axis=0), right_hand_side)
         if np.median(np.einsum("ni,ni->n", axes, center - centers)) > 0:
             return center, []
         return middle, ["the cameras look outwards: the scene is centred on the cameras"]
     spread = float(np.percentile(np.linalg.norm(centers - middle, axis=1), 90))
     forward = axes.mean(axis=0)
     forward = forward / np.linalg.norm(forward)
-    if spread < 1e-12:
+    if spread < MIN_DISTANCE:
         return middle + forward, [
-            "no_scale: one camera position and no points, so nothing tells the size of the scene; "
-            "its centre is taken one unit in front of the camera"
+            "no_scale: one camera position and no points, so the size of the scene is unknown; "
+            "its centre is assumed one unit in front of the camera"
         ]
     return middle + 2.0 * spread * forward, [
-        "no_parallax: all cameras look the same way and there are no points; "
-        "the centre is taken in front of them at twice their spread"
+        "no_parallax: all cameras look in the same direction and there are no points; "
+        "the centre is assumed in front of them at twice their spread"
     ]
 
 
-def _instants(stamps: Sequence[float]) -> dict[float, float]:
-    """Each time stamp and the instant it stands for: the first of those within `SAME_INSTANT` of the range."""
-    ordered = sorted(set(stamps))
+def _merged_times(times: Sequence[float]) -> dict[float, float]:
+    """Each time and the instant to which it is merged: the first of the times within `TIME_TOLERANCE` of the range."""
+    ordered = sorted(set(times))
     instants: dict[float, float] = {}
     current = -math.inf
-    for stamp in ordered:
-        if stamp - current > SAME_INSTANT * (ordered[-1] - ordered[0]):
-            current = stamp
-        instants[stamp] = current
+    for time in ordered:
+        if time - current > TIME_TOLERANCE * (ordered[-1] - ordered[0]):
+            current = time
+        instants[time] = current
     return instants
 
 
-def _at_most(camera: Camera, max_side: int | None) -> Camera:
+def _downscaled(camera: Camera, max_side: int | None) -> Camera:
     longest = max(camera.width, camera.height)
     if max_side is None or longest <= max_side:
         return camera

@@ -1,6 +1,6 @@
-"""Recording: what a reader found, in the capture's own lengths and times.
+"""RawCapture: the result of a reader, in the capture's own units of length and time.
 
-Plain data between the readers and `graings.capture.normalize`. Knows nothing of either.
+Plain data between the readers and `graings.capture.normalize`.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from graings.capture.capture import Split
 from graings.capture.image_file import ImageFile
 from graings.capture.lens import Lens
 
-# Larger lengths or times leave no room to compute with them: they are slips of the file.
-MAX_DISTANCE: Final = 1e15
+# Larger coordinates and times are errors of the file: differences of such numbers have too few digits left.
+MAX_MAGNITUDE: Final = 1e15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawFrame:
-    """One image as it was taken. `camera` has the capture's length unit and the undistorted picture's full size."""
+    """One image. `camera` is in the capture's unit of length and has the full size of the undistorted image."""
 
     image: ImageFile
     camera: Camera
-    time: float | None  # None: the capture says nothing of time
+    time: float | None  # None: the capture gives no times
     lens: Lens | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawCapture:
-    """All shots of a capture; `positions` [M, 3] in the capture's unit with `colors` [M, 3] in [0, 1]."""
+    """All frames of a capture; points `positions` [M, 3] in the capture's unit with `colors` [M, 3] in [0, 1]."""
 
     kind: Literal["transforms", "colmap"]
     splits: dict[Split, tuple[RawFrame, ...]]
@@ -48,12 +48,12 @@ class RawCapture:
         positions: NDArray[np.float64],
         colors: NDArray[np.float32],
     ) -> RawCapture:
-        """As the constructor, without points that cannot be computed with, of which a note then speaks."""
-        finite = np.asarray((np.abs(positions) <= MAX_DISTANCE).all(axis=1))  # False for NaN as well
+        """As the constructor, without points that are not finite or beyond `MAX_MAGNITUDE`; a note counts them."""
+        finite = np.asarray((np.abs(positions) <= MAX_MAGNITUDE).all(axis=1))  # False for NaN as well
         if not finite.all():
             notes = [
                 *notes,
-                f"{int((~finite).sum())} of {len(finite)} points are not finite or absurdly far and left out",
+                f"{int((~finite).sum())} of {len(finite)} points are discarded: not finite or beyond {MAX_MAGNITUDE:g}",
             ]
         if not finite.any():
             return RawCapture(kind, splits, tuple(notes))

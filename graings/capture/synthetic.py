@@ -1,7 +1,7 @@
-"""SyntheticScene: a few bodies that move, turn, squash and change colour, and captures of them with exact cameras.
+"""SyntheticScene: a few ellipsoids that move, rotate, deform and change colour, and captures of them.
 
-Everything is a formula of time, so tests can ask where a body really is. Written to disk in the D-NeRF layout: such a
-capture passes through the same reader as any other. Knows nothing of readers or of normalised units.
+Everything is a formula of time, so tests know the exact position of each body. Captures are written in the D-NeRF
+layout and read by the same reader as any other.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ CAMERA_DISTANCE: Final = 4.0
 FIELD_OF_VIEW: Final = 0.69  # horizontal, radians; both as in the D-NeRF scenes
 SAMPLES: Final = 4  # per pixel and axis
 
-# Bodies hang on a ring around the origin and swing about their places; the more there are, the smaller, so that they
-# cannot touch.
+# Bodies are placed on a ring around the origin and oscillate about these positions. Their size decreases with their
+# number, so that they cannot touch.
 RING: Final = 0.75
 SIDE_SWING: Final = 0.12
 LIFT: Final = 0.3
 LARGEST: Final = 0.42
-SQUASH: Final = 0.2  # relative change of the first semi-axis; the others take half of it, the other way
+SQUASH: Final = 0.2  # relative change of the first semi-axis; the others change by half of it with the opposite sign
 TURN: Final = 1.5  # radians from t = 0 to 1
 TINT: Final = 0.06  # amplitude of the change of colour
 
-# Lambert under one fixed light, mostly ambient: colour depends on where a body's surface faces, not on the viewer.
+# Lambertian shading under one fixed light, mostly ambient: colour depends on the surface normal, not on the view.
 LIGHT: Final = np.array([0.4, -0.3, 0.866])
 AMBIENT: Final = 0.75
 
-GOLDEN: Final = (math.sqrt(5.0) - 1.0) / 2.0
+GOLDEN_RATIO: Final = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
     """An ellipsoid with a two-coloured pattern."""
 
-    home: Array  # [3] centre of its swing
+    home: Array  # [3] mean centre
     swing: Array  # [3] amplitudes along x, y, z
     semi_axes: Array  # [3] at rest
-    axis: Array  # [3] unit axis it turns about
-    colors: Array  # [2, 3] the two ends of the pattern
+    axis: Array  # [3] unit axis of rotation
+    colors: Array  # [2, 3] the two colours of the pattern
     phases: Array  # [6] of swing (3), squash, tint, pattern
 
     def center(self, time: float) -> Array:
@@ -65,7 +65,7 @@ class Body:
         return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
     def radii(self, time: float) -> Array:
-        """Semi-axes [3], changing in time each by its own factor."""
+        """Semi-axes [3] at `time`; each changes by its own factor."""
         amount = SQUASH * math.sin(2 * np.pi * time + self.phases[3])
         return self.semi_axes * (1 + amount * np.array([1.0, -0.5, -0.5]))
 
@@ -83,26 +83,26 @@ class Body:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticScene:
-    """The bodies, in capture units: about 1.2 around the origin, z up."""
+    """The bodies, in capture units: within about 1.2 of the origin, z up."""
 
     bodies: tuple[Body, ...]
 
     @staticmethod
     def random(seed: int = 0, bodies: int = 3) -> SyntheticScene:
-        """The scene of a seed."""
+        """A random scene of `bodies` bodies, determined by `seed`."""
         if bodies < 1:
             raise ValueError(f"bodies must be at least 1, got {bodies}")
         rng = np.random.default_rng(seed)
         spacing = 2 * RING * math.sin(math.pi / bodies) if bodies > 1 else 2 * RING
         side = min(SIDE_SWING, 0.09 * spacing)
         largest = min(LARGEST, (spacing - 2 * math.sqrt(2) * side) / (2 * (1 + SQUASH)))
-        made = []
+        random_bodies = []
         for index in range(bodies):
             angle = 2 * math.pi * index / bodies + 0.3
             reach = RING if bodies > 1 else 0.0
             axis = rng.normal(size=3) + np.array([0.0, 0.0, 2.0])
             hue = index / bodies + rng.uniform(0, 0.15)
-            made.append(
+            random_bodies.append(
                 Body(
                     home=np.array([reach * math.cos(angle), reach * math.sin(angle), rng.uniform(-0.15, 0.15)]),
                     swing=np.array([side, side, LIFT]),
@@ -112,20 +112,20 @@ class SyntheticScene:
                     phases=rng.uniform(0, 2 * np.pi, size=6),
                 )
             )
-        return SyntheticScene(tuple(made))
+        return SyntheticScene(tuple(random_bodies))
 
     def centers(self, time: float) -> Array:
         """Exact centre of every body at `time`, [bodies, 3]."""
         return np.stack([body.center(time) for body in self.bodies])
 
     def image(self, camera: Camera, time: float) -> Array:
-        """What `camera` (capture units) sees: RGBA [H, W, 4] in [0, 1], straight alpha, ray-cast and anti-aliased."""
+        """The image of `camera` (capture units): RGBA [H, W, 4] in [0, 1], straight alpha, ray-cast, anti-aliased."""
         width, height = camera.width * SAMPLES, camera.height * SAMPLES
         fine = camera.resized(width, height)
         depth = np.full((height, width), np.inf)
         color = np.zeros((height, width, 3))
         for body in self.bodies:
-            _cast(body, time, fine, depth, color)
+            _ray_cast(body, time, fine, depth, color)
         hit = np.isfinite(depth).reshape(camera.height, SAMPLES, camera.width, SAMPLES)
         sums = color.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).sum(axis=(1, 3))
         count = hit.sum(axis=(1, 3))[..., None]
@@ -133,10 +133,10 @@ class SyntheticScene:
 
 
 def write_synthetic(folder: Path, *, seed: int = 0, frames: int = 60, size: int = 128, bodies: int = 3) -> Path:
-    """Write a capture of `frames` training images of `size` px into `folder`, which is returned.
+    """Write a capture of `frames` training images of `size` x `size` px into `folder`, which is returned.
 
-    One moving camera, one image per time, as D-NeRF; val and test each have an eighth as many images, at times between
-    those of training and from other directions.
+    One moving camera with one image per time, as in D-NeRF. The val and test splits each have an eighth as many images,
+    at other times and from other directions than the training images.
     """
     if frames < 1 or size < 1:
         raise ValueError(f"frames and size must be at least 1, got {frames} and {size}")
@@ -151,7 +151,7 @@ def write_synthetic(folder: Path, *, seed: int = 0, frames: int = 60, size: int 
         (folder / split).mkdir(parents=True, exist_ok=True)
         entries = []
         for index, time in enumerate(times[split]):
-            camera = _hemisphere(index, start=seed * GOLDEN + number / 3, size=size)
+            camera = _hemisphere(index, start=seed * GOLDEN_RATIO + number / 3, size=size)
             name = f"{split}/r_{index:03d}"
             _write_png(folder / f"{name}.png", scene.image(camera, time))
             pose = np.linalg.inv(camera.world_to_camera)
@@ -163,20 +163,20 @@ def write_synthetic(folder: Path, *, seed: int = 0, frames: int = 60, size: int 
 
 
 def _hemisphere(index: int, *, start: float, size: int) -> Camera:
-    # Golden-ratio steps: however many frames, directions are spread evenly and neighbours in time are far apart.
-    azimuth = 360.0 * (start + index * GOLDEN)
-    elevation = 10.0 + 50.0 * ((start + index * GOLDEN**2 * math.sqrt(2.0)) % 1.0)
+    # Golden-ratio steps spread any number of directions evenly and keep neighbours in time far apart.
+    azimuth = 360.0 * (start + index * GOLDEN_RATIO)
+    elevation = 10.0 + 50.0 * ((start + index * GOLDEN_RATIO**2 * math.sqrt(2.0)) % 1.0)
     return Camera.orbit(azimuth, elevation, CAMERA_DISTANCE, fov=FIELD_OF_VIEW, width=size, height=size)
 
 
-def _cast(body: Body, time: float, camera: Camera, depth: NDArray[np.float64], color: Array) -> None:
-    """Draw a body into `depth` [H, W] and `color` [H, W, 3] where it is the nearest."""
+def _ray_cast(body: Body, time: float, camera: Camera, depth: NDArray[np.float64], color: Array) -> None:
+    """Render a body into `depth` [H, W] and `color` [H, W, 3] where it is nearest."""
     pose = camera.world_to_camera
     center, rotation, radii = body.center(time), body.rotation(time), body.radii(time)
-    rows, columns = _shadow(pose[:3, :3] @ center + pose[:3, 3], float(radii.max()), camera)
+    rows, columns = _bounding_box(pose[:3, :3] @ center + pose[:3, 3], float(radii.max()), camera)
     x = (np.arange(columns.start, columns.stop) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(rows.start, rows.stop) + 0.5 - camera.cy) / camera.fy
-    # In the body's axes divided by its radii it is the unit sphere; rays keep depth 1 per unit of their parameter.
+    # In body axes divided by the radii the body is the unit sphere; a ray's parameter remains the camera depth.
     to_body = rotation.T / radii[:, None]
     origin = to_body @ (camera.center - center)
     steps = to_body @ pose[:3, :3].T
@@ -193,8 +193,8 @@ def _cast(body: Body, time: float, camera: Camera, depth: NDArray[np.float64], c
     color[rows, columns][first] = body.surface(points, normals, time)
 
 
-def _shadow(center: Array, radius: float, camera: Camera) -> tuple[slice, slice]:
-    """Rows and columns that a sphere in front of the camera can touch."""
+def _bounding_box(center: Array, radius: float, camera: Camera) -> tuple[slice, slice]:
+    """Rows and columns that contain the image of a sphere in front of the camera."""
     slices = []
     for along, focal, principal, size in (
         (center[1], camera.fy, camera.cy, camera.height),
@@ -217,6 +217,6 @@ def _write_png(path: Path, rgba: Array) -> None:
     pixels = np.ascontiguousarray(np.round(rgba * 255.0).astype(np.uint8))
     output = oiio.ImageOutput.create(str(path))
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 4, "uint8")
-    spec["oiio:UnassociatedAlpha"] = 1  # the colours are straight: store them as they are
+    spec["oiio:UnassociatedAlpha"] = 1  # colours have straight alpha and must be stored unchanged
     if output is None or not (output.open(str(path), spec) and output.write_image(pixels) and output.close()):
         raise OSError(f"cannot write {path}: {oiio.geterror() if output is None else output.geterror()}")

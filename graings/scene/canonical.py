@@ -1,7 +1,4 @@
-"""Canonical geometry of the children: rotation and log-scale from StaticMLP (Eq. 5).
-
-Knows nothing of time, viewing direction or pixels.
-"""
+"""Canonical geometry of the child Gaussians: rotation and log-scale from StaticMLP (Eq. 5)."""
 
 from __future__ import annotations
 
@@ -15,17 +12,17 @@ from graings.config import SceneConfig
 from graings.scene.children import Children
 from graings.scene.perceptron import GroupBias, perceptron
 
-# A child starts with about half the spacing of its neighbours as standard deviation: they overlap, but
-# none hides the next (decision 12).
+# Initial standard deviation of a child in units of s_a, the spacing of its neighbours: Gaussians overlap, but none
+# covers the next one completely.
 INITIAL_SCALE = 0.5
 
 
 class StaticMLP(nn.Module):
-    """(f_a, eps_j, e_j) -> (r_can, rho_can) for each child by itself, Eq. 5.
+    """(f_a, eps_j, e_j) -> (r_can, rho_can) for each child independently, Eq. 5.
 
-    `e_j` is a learned code per child slot shared by all anchors (decision 1), here directly its share of the
-    first layer: the children of a new anchor have zero offsets and would otherwise be identical for ever.
-    rho_can is relative to log s_a. The feature's share of the first layer is computed once per anchor.
+    `e_j` is a learned code per child slot that all anchors share; it is stored directly as its part of the first
+    layer. Without it the children of a new anchor, whose offsets are all zero, would stay identical. rho_can is
+    relative to log s_a. The feature's part of the first layer is computed once per anchor.
     """
 
     def __init__(self, config: SceneConfig) -> None:
@@ -40,17 +37,17 @@ class StaticMLP(nn.Module):
             self.out.bias.zero_()
             self.out.bias[4:] = math.log(INITIAL_SCALE)
 
-    def forward(self, features: Float[Tensor, "anchor feature"], drawn: Children) -> Float[Tensor, "drawn 7"]:
-        """Quaternion less the identity and log-scale less log s_a of the drawn children."""
+    def forward(self, features: Float[Tensor, "anchor feature"], children: Children) -> Float[Tensor, "gaussian 7"]:
+        """Of each child: quaternion minus the identity (1, 0, 0, 0), and log-scale minus log s_a."""
         first = torch.cat([self.from_offset.weight, self.child_bias.t()], dim=1)
         shared = perceptron(features, [self.from_feature.weight], [self.from_feature.bias])
-        none = torch.zeros_like(self.from_feature.bias)
-        weights, biases = [first, self.out.weight], [none, self.out.bias]
-        return perceptron(drawn.inputs, weights, biases, shared=GroupBias(shared, drawn.anchors))
+        zero_bias = torch.zeros_like(self.from_feature.bias)
+        weights, biases = [first, self.out.weight], [zero_bias, self.out.bias]
+        return perceptron(children.inputs, weights, biases, shared=GroupBias(shared, children.anchors))
 
 
-def default_geometry(children: Float[Tensor, "drawn 3"]) -> Float[Tensor, "drawn 7"]:
-    """What StaticMLP's answer is where there is none: no rotation, the initial scale."""
-    answer = children.new_zeros(len(children), 7)
-    answer[:, 4:] = math.log(INITIAL_SCALE)
-    return answer
+def default_geometry(canonical_means: Float[Tensor, "gaussian 3"]) -> Float[Tensor, "gaussian 7"]:
+    """The canonical geometry of a scene without StaticMLP (ablation): identity rotation and the initial scale."""
+    geometry = canonical_means.new_zeros(len(canonical_means), 7)
+    geometry[:, 4:] = math.log(INITIAL_SCALE)
+    return geometry

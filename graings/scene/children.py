@@ -1,11 +1,12 @@
-"""The drawn children: what the networks read of them, and the geometry that the networks' answers make.
+"""Children: inputs of the geometry networks per child Gaussian (Eq. 4), and composed geometry (Eq. 10).
 
 Two operators of the compiled kernel, each with its oracle in plain torch: as a chain of small torch operations they
-took longer than the networks between them. Knows nothing of networks, cameras, colours or opacity.
+took longer than the networks between them.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,35 +20,35 @@ from graings import kernel
 from graings.scene.clip import clip
 from graings.scene.scaffold import Scaffold
 
-# Bound on the change of a log-scale in time (Eq. 10).
-LOG_SCALE_BOUND = 2.0
+# The offset of a log-scale in time is clipped to plus or minus this (Eq. 10).
+MAX_LOG_SCALE_OFFSET = 2.0
 
-# Log standard deviations are kept in this range of normalised units: a factor 1e7 below and 100 above the
-# scene. Outside, exp and its square would leave float32 (numerics, 2.8).
-LOG_SCALE_RANGE = (-16.118095650958319, 4.605170185988092)
+# Log standard deviations are clipped to this range: 1e-7 to 100 in normalised units, in which the scene is about 1
+# across. Variances beyond it, and their inverses, would overflow float32.
+LOG_SCALE_RANGE = (math.log(1e-7), math.log(100.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Children:
-    """What is known of N drawn children before any network has spoken."""
+    """What N rendered children have from the scaffold alone, without any network."""
 
-    anchors: Int64[Tensor, " drawn"]  # the anchor of each, ascending
-    inputs: Float[Tensor, "drawn width"]  # offset, and a one at the child's slot
-    centres: Float[Tensor, "drawn 3"]  # x_can, Eq. 4
-    log_scales: Float[Tensor, "drawn 3"]  # log s_a of the anchor
+    anchors: Int64[Tensor, " gaussian"]  # index of the anchor of each, ascending
+    inputs: Float[Tensor, "gaussian width"]  # offset epsilon, and a one-hot vector of the child's slot
+    canonical_means: Float[Tensor, "gaussian 3"]  # x_can of Eq. 4, normalised units
+    anchor_log_scales: Float[Tensor, "gaussian 3"]  # log s_a of the anchor
 
 
-def gather(scaffold: Scaffold, children: Int64[Tensor, " drawn"]) -> Children:
-    """The drawn children of `scaffold`: flat slots (anchor * k + child) in ascending order.
+def gather(scaffold: Scaffold, children: Int64[Tensor, " gaussian"]) -> Children:
+    """The children at the given flat slots (anchor * k + child) of `scaffold`, which must ascend; Eq. 4.
 
-    Raises `ValueError` for any other order or slot.
+    Raises `ValueError` for slots out of order or out of range.
     """
     tensors = (scaffold.log_scales, scaffold.offsets, scaffold.anchors)
-    inputs, centres, log_scales = _Gather.apply(*tensors, children, kernel.thread_count())  # type: ignore[no-untyped-call]
-    return Children(children // scaffold.slots, inputs, centres, log_scales)
+    inputs, means, log_scales = _Gather.apply(*tensors, children, kernel.thread_count())  # type: ignore[no-untyped-call]
+    return Children(children // scaffold.slots, inputs, means, log_scales)
 
 
-def plain_gather(scaffold: Scaffold, children: Int64[Tensor, " drawn"]) -> Children:
+def plain_gather(scaffold: Scaffold, children: Int64[Tensor, " gaussian"]) -> Children:
     """The oracle of `gather`."""
     k = scaffold.slots
     owners = children // k
@@ -58,33 +59,34 @@ def plain_gather(scaffold: Scaffold, children: Int64[Tensor, " drawn"]) -> Child
     return Children(owners, inputs, scaffold.anchors.index_select(0, owners) + log_scales.exp() * offsets, log_scales)
 
 
-Geometry = tuple[Float[Tensor, "drawn 3"], Float[Tensor, "drawn 4"], Float[Tensor, "drawn 3"]]
+# Means, quaternions and log-scales.
+Geometry = tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"], Float[Tensor, "gaussian 3"]]
 
 
 def compose(
-    canonical: Float[Tensor, "drawn 7"],
+    canonical: Float[Tensor, "gaussian 7"],
     children: Children,
-    moved: Float[Tensor, "drawn 10"] | None,
+    deformation: Float[Tensor, "gaussian 10"] | None,
     extent: float,
     *,
     projected_clip: bool,
 ) -> Geometry:
-    """(means, quaternions, log-scales) of the drawn children, Eq. 5 and 10.
+    """Means, quaternions and log-scales of the rendered children, Eq. 10.
 
-    `canonical` is StaticMLP's answer: quaternion less the identity, log-scale less the anchor's. `moved` is
-    DeformNet's: position in units of `extent`, rotation less the identity, log-scale; None while nothing moves.
-    Quaternions are not normalised after they were turned (the rasterizer does that once).
+    `canonical` is the output of StaticMLP: quaternion minus the identity, log-scale minus the anchor's. `deformation`
+    is that of DeformNet: offsets of position in units of `extent`, of rotation (minus the identity) and of log-scale;
+    None for a static scene. Canonical quaternions are normalised; their product with Delta r is not, because the
+    rasterizer normalises it.
     """
-    values: Geometry = _Compose.apply(  # type: ignore[no-untyped-call]
-        canonical, children.log_scales, children.centres, moved, extent, projected_clip, kernel.thread_count()
-    )
-    return values
+    inputs = (canonical, children.anchor_log_scales, children.canonical_means, deformation)
+    geometry: Geometry = _Compose.apply(*inputs, extent, projected_clip, kernel.thread_count())  # type: ignore[no-untyped-call]
+    return geometry
 
 
 def plain_compose(
-    canonical: Float[Tensor, "drawn 7"],
+    canonical: Float[Tensor, "gaussian 7"],
     children: Children,
-    moved: Float[Tensor, "drawn 10"] | None,
+    deformation: Float[Tensor, "gaussian 10"] | None,
     extent: float,
     *,
     projected_clip: bool,
@@ -92,17 +94,17 @@ def plain_compose(
     """The oracle of `compose`."""
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=canonical.dtype)
     quats = functional.normalize(canonical[:, :4] + identity, dim=-1, eps=1e-12)
-    log_scales = children.log_scales + canonical[:, 4:]
-    means = children.centres
-    if moved is not None:
-        means = means + moved[:, :3] * extent
-        quats = quaternion_product(quats, moved[:, 3:7] + identity)
-        change = clip(moved[:, 7:], -LOG_SCALE_BOUND, LOG_SCALE_BOUND, projected=projected_clip)
-        log_scales = log_scales + change
+    log_scales = children.anchor_log_scales + canonical[:, 4:]
+    means = children.canonical_means
+    if deformation is not None:
+        means = means + deformation[:, :3] * extent
+        quats = quaternion_product(quats, deformation[:, 3:7] + identity)
+        offsets = clip(deformation[:, 7:], -MAX_LOG_SCALE_OFFSET, MAX_LOG_SCALE_OFFSET, projected=projected_clip)
+        log_scales = log_scales + offsets
     return means, quats, clip(log_scales, *LOG_SCALE_RANGE, projected=projected_clip)
 
 
-def quaternion_product(a: Float[Tensor, "drawn 4"], b: Float[Tensor, "drawn 4"]) -> Float[Tensor, "drawn 4"]:
+def quaternion_product(a: Float[Tensor, "gaussian 4"], b: Float[Tensor, "gaussian 4"]) -> Float[Tensor, "gaussian 4"]:
     """Hamilton product of (w, x, y, z) quaternions, not normalised."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
@@ -122,21 +124,21 @@ class _Gather(torch.autograd.Function):
     def forward(
         ctx: Any, log_scales: Tensor, offsets: Tensor, anchors: Tensor, children: Tensor, threads: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        ready = [t.detach().contiguous() for t in (anchors, log_scales, offsets)]
-        drawn = len(children)
-        inputs = anchors.new_empty(drawn, 3 + offsets.shape[1])
-        centres, bases = anchors.new_empty(drawn, 3), anchors.new_empty(drawn, 3)
-        kernel.kernel().gather(*ready, children, inputs, centres, bases, threads)
-        ctx.save_for_backward(*ready, children)
+        tensors = [t.detach().contiguous() for t in (anchors, log_scales, offsets)]
+        count = len(children)
+        inputs = anchors.new_empty(count, 3 + offsets.shape[1])
+        means, anchor_log_scales = anchors.new_empty(count, 3), anchors.new_empty(count, 3)
+        kernel.kernel().gather(*tensors, children, inputs, means, anchor_log_scales, threads)
+        ctx.save_for_backward(*tensors, children)
         ctx.threads = threads
-        return inputs, centres, bases
+        return inputs, means, anchor_log_scales
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_inputs: Tensor, v_centres: Tensor, v_bases: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, v_inputs: Tensor, v_means: Tensor, v_anchor_log_scales: Tensor) -> tuple[Tensor | None, ...]:
         anchors, log_scales, offsets, children = ctx.saved_tensors
         gradients = [torch.empty_like(t) for t in (log_scales, offsets)]
-        upstream = [v.contiguous() for v in (v_inputs, v_centres, v_bases)]
+        upstream = [v.contiguous() for v in (v_inputs, v_means, v_anchor_log_scales)]
         kernel.kernel().gather_gradient(anchors, log_scales, offsets, children, *upstream, *gradients, ctx.threads)
         return (*gradients, None, None, None)
 
@@ -146,30 +148,30 @@ class _Compose(torch.autograd.Function):
     def forward(
         ctx: Any,
         canonical: Tensor,
-        bases: Tensor,
-        centres: Tensor,
-        moved: Tensor | None,
+        anchor_log_scales: Tensor,
+        canonical_means: Tensor,
+        deformation: Tensor | None,
         extent: float,
         projected: bool,
         threads: int,
     ) -> Geometry:
-        ready = [None if t is None else t.detach().contiguous() for t in (canonical, bases, centres, moved)]
-        means, quats = torch.empty_like(centres), centres.new_empty(len(centres), 4)
-        log_scales = torch.empty_like(centres)
-        ctx.constants = (extent, LOG_SCALE_BOUND, *LOG_SCALE_RANGE, projected)
-        kernel.kernel().compose(*ready, *ctx.constants, means, quats, log_scales, threads)
-        ctx.save_for_backward(*ready)
+        inputs = (canonical, anchor_log_scales, canonical_means, deformation)
+        tensors = [None if t is None else t.detach().contiguous() for t in inputs]
+        means, quats = torch.empty_like(canonical_means), canonical_means.new_empty(len(canonical_means), 4)
+        log_scales = torch.empty_like(canonical_means)
+        ctx.constants = (extent, MAX_LOG_SCALE_OFFSET, *LOG_SCALE_RANGE, projected)
+        kernel.kernel().compose(*tensors, *ctx.constants, means, quats, log_scales, threads)
+        ctx.save_for_backward(*tensors)
         ctx.threads = threads
         return means, quats, log_scales
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_means: Tensor, v_quats: Tensor, v_log_scales: Tensor) -> tuple[Tensor | None, ...]:
-        canonical, bases, centres, moved = ctx.saved_tensors
+        canonical, anchor_log_scales, canonical_means, deformation = ctx.saved_tensors
         v_canonical = torch.empty_like(canonical)
-        v_moved = None if moved is None else torch.empty_like(moved)
+        v_deformation = None if deformation is None else torch.empty_like(deformation)
+        inputs = (canonical, anchor_log_scales, canonical_means, deformation)
         upstream = [v.contiguous() for v in (v_means, v_quats, v_log_scales)]
-        kernel.kernel().compose_gradient(
-            canonical, bases, centres, moved, *ctx.constants, *upstream, v_canonical, v_moved, ctx.threads
-        )
-        return v_canonical, v_canonical[:, 4:], v_means, v_moved, None, None, None
+        kernel.kernel().compose_gradient(*inputs, *ctx.constants, *upstream, v_canonical, v_deformation, ctx.threads)
+        return v_canonical, v_canonical[:, 4:], v_means, v_deformation, None, None, None

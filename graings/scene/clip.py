@@ -1,8 +1,8 @@
-"""Clip with a projected gradient.
+"""Clip with a projected gradient, for the log-scales of Eq. 10 and the colours of Eq. 13.
 
-The forward value is the plain clip. The plain derivative is zero outside the bounds, so a value that has
-left can never be pulled back by the image. The projected derivative passes a gradient where the value is
-inside, and outside where the descent step points back in: gradient descent projected on the box.
+The forward value is the plain clip. The plain derivative is zero outside the bounds, so a value that has left them
+never returns. The projected derivative also passes a gradient outside where the descent step points back inside: this
+is gradient descent projected on the box.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ class _ProjectedClip(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
         (grad,) = grad_outputs
-        blocked = ((x > ctx.high) & (grad < 0)) | ((x < ctx.low) & (grad > 0))
-        return grad.masked_fill(blocked, 0.0), None, None
+        outward = ((x > ctx.high) & (grad < 0)) | ((x < ctx.low) & (grad > 0))
+        return grad.masked_fill(outward, 0.0), None, None
 
 
 def clip(x: Tensor, low: float, high: float, *, projected: bool) -> Tensor:
-    """`x` limited to [low, high]; `projected` chooses the gradient (see the module docstring)."""
+    """`x` limited to [low, high]; with `projected` the gradient is that of the module docstring, else torch's."""
     if projected:
         result: Tensor = _ProjectedClip.apply(x, low, high)  # type: ignore[no-untyped-call]
         return result

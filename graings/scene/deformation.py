@@ -1,7 +1,6 @@
-"""DeformationNetwork: an offset in time for each Gaussian (Eq. 7).
+"""DeformNet: offsets of position, rotation and log-scale in time for each Gaussian (Eq. 7).
 
-Knows nothing of appearance, cameras or pixels. Whether its positions are detached is the scene's
-decision, not this module's.
+The stop-gradient of Eq. 7 is applied by `Scene`, which passes the positions.
 """
 
 from __future__ import annotations
@@ -22,30 +21,35 @@ from graings.scene.perceptron import GroupBias, perceptron, weights_and_biases
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deformation:
-    """Raw offsets of N Gaussians at one time: of position (normalised units), rotation and log-scales.
+    """Offsets of N Gaussians at one time (Eq. 7): position (3, normalised units), rotation (4) and log-scale (3).
 
-    Rotation is delta with Delta r = normalise((1, 0, 0, 0) + delta) (decision 11); log-scales are not yet clipped.
+    The rotation is delta with Delta r = (1, 0, 0, 0) + delta up to its length, so that zero is no rotation. Log-scales
+    are those before the clip of Eq. 10.
     """
 
     offsets: Float[Tensor, "gaussian 10"]
 
     @property
     def position(self) -> Float[Tensor, "gaussian 3"]:
-        """What is added to the canonical position."""
+        """Delta x, which is added to the canonical position."""
         return self.offsets[:, :3]
 
 
 def deformation_from(raw: Float[Tensor, "gaussian 10"], extent: float) -> Deformation:
-    """Network output to offsets; positions come in units of the scene's extent, so rates need no length."""
+    """Offsets from the output of DeformNet, whose positions are in units of `extent` (the scene's half-size).
+
+    In these units learning rates do not depend on the size of the scene.
+    """
     return Deformation(raw * torch.tensor([extent] * 3 + [1.0] * 7, dtype=raw.dtype))
 
 
 class DeformationNetwork(nn.Module):
-    """(position, gamma(t)) -> raw offsets [N, 10]; exactly zero at birth.
+    """(sg(x_can), gamma(t)) -> offsets [N, 10], Eq. 7; zero at initialization.
 
-    With `time_conditioning` factorized it is W (phi(x) * psi(gamma(t))) + b: the hidden layers give each position its
-    weights on `deform_width` motions, psi the amplitude of each motion at the time. All positions of a frame share
-    psi, so it costs one row. With concatenated the encoded time is a further input of the first layer, added as a bias.
+    With factorized `time_conditioning` it is W (phi(x) * psi(gamma(t))) + b: the hidden layers phi give each position
+    its weights on `deform_width` motions, psi the amplitude of each motion at a time. psi is evaluated once per time,
+    not once per Gaussian. With concatenated `time_conditioning` the encoded time is a further input of the first layer,
+    added as a bias.
     """
 
     def __init__(self, config: SceneConfig) -> None:
@@ -63,26 +67,29 @@ class DeformationNetwork(nn.Module):
     def forward(
         self, positions: Float[Tensor, "gaussian 3"], times: Float[Tensor, "time 1"]
     ) -> Float[Tensor, "time gaussian 10"]:
-        """`positions` in units of the scene's extent, `times` in [0, 1].
+        """Offsets for `positions` in units of the scene's extent at `times` in [0, 1].
 
-        In a product a further time is ten further outputs: the hidden layers run once.
+        With factorized time the hidden layers run once for all times: each further time adds ten outputs.
         """
-        encoded = frequency_encoding(positions, self.position_frequencies)
-        moments = frequency_encoding(times, self.time_frequencies)
+        encoded_positions = frequency_encoding(positions, self.position_frequencies)
+        encoded_times = frequency_encoding(times, self.time_frequencies)
         weights, biases = weights_and_biases([self.from_position, *self.hidden, self.out])
         if self.psi is not None:
-            weights[-1] = (weights[-1] * self.psi(moments).unsqueeze(1)).flatten(0, 1)
+            weights[-1] = (weights[-1] * self.psi(encoded_times).unsqueeze(1)).flatten(0, 1)
             biases[-1] = biases[-1].repeat(len(times))
-            return perceptron(encoded, weights, biases).unflatten(1, (len(times), -1)).transpose(0, 1)
+            return perceptron(encoded_positions, weights, biases).unflatten(1, (len(times), -1)).transpose(0, 1)
         assert self.from_time is not None
         first, *others = biases
         return torch.stack(
-            [perceptron(encoded, weights, [first + shift, *others]) for shift in self.from_time(moments)]
+            [
+                perceptron(encoded_positions, weights, [first + from_time, *others])
+                for from_time in self.from_time(encoded_times)
+            ]
         )
 
 
 def time_modules(config: SceneConfig) -> tuple[nn.Linear | None, nn.Sequential | None]:
-    """What encoded time goes through: to the first layer as a bias, or to the last one as weights; one of the two."""
+    """The layers of the encoded time: `from_time` for concatenated or `psi` for factorized time; the other is None."""
     width, time_width = config.deform_width, encoding_width(1, config.time_frequencies)
     if config.time_conditioning == "concatenated":
         return nn.Linear(time_width, width, bias=False), None
@@ -93,8 +100,8 @@ def time_modules(config: SceneConfig) -> tuple[nn.Linear | None, nn.Sequential |
 class SingleMLP(nn.Module):
     """Ablation `single_mlp`: one network for canonical and temporal geometry.
 
-    (f_a, eps_j, e_j, position, gamma(t)) -> [N, 17]: 7 canonical outputs as StaticMLP's, 10 as
-    DeformationNetwork's, into which time enters as there. Without a time (`time` None, warm-up) it does not.
+    (f_a, eps_j, e_j, x_can, gamma(t)) -> [N, 17]: 7 outputs as those of StaticMLP, 10 as those of DeformationNetwork,
+    with the same time conditioning.
     """
 
     def __init__(self, config: SceneConfig) -> None:
@@ -118,20 +125,20 @@ class SingleMLP(nn.Module):
     def forward(
         self,
         features: Float[Tensor, "anchor feature"],
-        drawn: Children,
+        children: Children,
         positions: Float[Tensor, "gaussian 3"],
         time: Tensor | None,
     ) -> Float[Tensor, "gaussian 17"]:
-        """Raw outputs of the drawn children: the first two as in StaticMLP, the rest as in DeformationNetwork."""
+        """Outputs for `children` at `positions` in units of the scene's extent; `time` is None during the warm-up."""
         first = [self.from_offset.weight, self.child_bias.t(), self.from_position.weight]
-        everything = [drawn.inputs, frequency_encoding(positions, self.position_frequencies)]
+        inputs = [children.inputs, frequency_encoding(positions, self.position_frequencies)]
         shared = perceptron(features, [self.from_feature.weight], [self.from_feature.bias])
         weights, biases = weights_and_biases([*self.hidden, self.out])
         weights, biases = [torch.cat(first, dim=1), *weights], [torch.zeros_like(self.from_feature.bias), *biases]
-        moment = None if time is None else frequency_encoding(time, self.time_frequencies)
-        if moment is not None and self.from_time is not None:
-            biases[0] = biases[0] + self.from_time(moment)
-        if moment is not None and self.psi is not None:
+        encoded_time = None if time is None else frequency_encoding(time, self.time_frequencies)
+        if encoded_time is not None and self.from_time is not None:
+            biases[0] = biases[0] + self.from_time(encoded_time)
+        if encoded_time is not None and self.psi is not None:
             canonical, temporal = weights[-1].split([7, 10])
-            weights[-1] = torch.cat([canonical, temporal * self.psi(moment)])
-        return perceptron(torch.cat(everything, dim=1), weights, biases, shared=GroupBias(shared, drawn.anchors))
+            weights[-1] = torch.cat([canonical, temporal * self.psi(encoded_time)])
+        return perceptron(torch.cat(inputs, dim=1), weights, biases, shared=GroupBias(shared, children.anchors))

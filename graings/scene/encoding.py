@@ -1,7 +1,8 @@
-"""Encodings: frequencies of positions and times, spherical harmonics of directions.
+"""Encodings: frequencies of positions and times (gamma of Eq. 7 and 12), spherical harmonics of directions.
 
-Positions are constants to the networks that read them (Eq. 7), and directions to the colour head, so that the kernel
-encodes them; of mirrors it knows the way back. Knows nothing of the networks.
+The compiled kernel computes values, and gradients with respect to the normals of reflected directions. Gradients with
+respect to positions and directions are needed in ablations and tests only and are left to torch: the stop-gradient of
+Eq. 7 makes positions constants.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from torch.autograd.function import once_differentiable
 
 from graings import kernel
 
-# Added to a normal's squared length, here and in the kernel: below a thousandth it fades out instead of spinning.
+# Added to a normal's squared length, here and in the kernel: for a length below 1e-3 the reflection fades out, because
+# the direction of so short a normal is noise.
 _NORMAL_EPSILON = 1e-6
 
 
@@ -28,8 +30,8 @@ def encoding_width(dimensions: int, octaves: int) -> int:
 def frequency_encoding(x: Float[Tensor, "*batch dim"], octaves: int) -> Float[Tensor, "*batch width"]:
     """(x, sin 2^0 x, ..., sin 2^(L-1) x, cos 2^0 x, ..., cos 2^(L-1) x) with L = `octaves`.
 
-    The raw value comes along and the frequencies carry no factor pi (decision 13), so that over [0, 1] the
-    lowest octave is monotone and t = 0 and t = 1 never alias. Differentiable where `x` wants a gradient.
+    The raw value is included and the frequencies have no factor pi, so that over [0, 1] the lowest octave is monotone
+    and t = 0 and t = 1 have different encodings. Differentiable where `x` requires a gradient.
     """
     if octaves == 0:
         return x
@@ -41,19 +43,19 @@ def frequency_encoding(x: Float[Tensor, "*batch dim"], octaves: int) -> Float[Te
 
 
 def plain_frequency_encoding(x: Float[Tensor, "*batch dim"], octaves: int) -> Float[Tensor, "*batch width"]:
-    """The oracle of `frequency_encoding`, and what it is where `x` wants a gradient."""
+    """The oracle of `frequency_encoding`, which also calls it where `x` requires a gradient."""
     frequencies = 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device)
     phases = (x.unsqueeze(-1) * frequencies).flatten(-2)
     return torch.cat([x, phases.sin(), phases.cos()], dim=-1)
 
 
-def mirrored(directions: Float[Tensor, "*batch 3"], vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """Unit vectors mirrored at the planes across `vectors`, which may have any length; at zero nothing is mirrored.
+def reflected(directions: Float[Tensor, "*batch 3"], normals: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Unit `directions` reflected at planes with `normals` of any length; a normal of zero reflects nothing.
 
-    It is the direction from which a mirror with that normal shows light (Ref-NeRF, Eq. 4, as seen from the camera).
+    This is Eq. 4 of Ref-NeRF for directions that point from the camera to the surface.
     """
-    squared = vectors.square().sum(dim=-1, keepdim=True) + _NORMAL_EPSILON
-    return directions - 2 * ((directions * vectors).sum(dim=-1, keepdim=True) / squared) * vectors
+    squared = normals.square().sum(dim=-1, keepdim=True) + _NORMAL_EPSILON
+    return directions - 2 * ((directions * normals).sum(dim=-1, keepdim=True) / squared) * normals
 
 
 def direction_width(degree: int) -> int:
@@ -64,28 +66,29 @@ def direction_width(degree: int) -> int:
 def direction_encoding(
     directions: Float[Tensor, "*batch 3"], degree: int, normals: Float[Tensor, "*batch 3"] | None = None
 ) -> Float[Tensor, "*batch width"]:
-    """Real spherical harmonics of degrees 1 to `degree` (at most 3) of unit vectors; a bias is that of degree 0.
+    """Real spherical harmonics of degrees 1 to `degree` (at most 3) of unit vectors; degree 0 is left to a bias.
 
-    Scaled so that those of degree 1 are the direction itself: each has the mean square 1/3 over all directions. With
-    `normals` as many more follow, of the directions `mirrored` there. Differentiable where the two want a gradient.
+    They are scaled so that those of degree 1 are the direction itself: each has the mean square 1/3 over all
+    directions. With `normals`, those of the directions `reflected` at them follow, which doubles the width.
+    Differentiable where either input requires a gradient.
     """
     if directions.requires_grad and torch.is_grad_enabled():
         return plain_direction_encoding(directions, degree, normals)
-    encoded: Tensor = _Directions.apply(directions, normals, degree, kernel.thread_count())  # type: ignore[no-untyped-call]
+    encoded: Tensor = _DirectionEncoding.apply(directions, normals, degree, kernel.thread_count())  # type: ignore[no-untyped-call]
     return encoded
 
 
 def plain_direction_encoding(
     directions: Float[Tensor, "*batch 3"], degree: int, normals: Float[Tensor, "*batch 3"] | None = None
 ) -> Float[Tensor, "*batch width"]:
-    """The oracle of `direction_encoding`, and what it is where `directions` want a gradient."""
-    encoded = _harmonics(directions, degree)
+    """The oracle of `direction_encoding`, which also calls it where `directions` require a gradient."""
+    encoded = _spherical_harmonics(directions, degree)
     if normals is None:
         return encoded
-    return torch.cat([encoded, _harmonics(mirrored(directions, normals), degree)], dim=-1)
+    return torch.cat([encoded, _spherical_harmonics(reflected(directions, normals), degree)], dim=-1)
 
 
-def _harmonics(directions: Tensor, degree: int) -> Tensor:
+def _spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
     x, y, z = directions.unbind(-1)
     harmonics = [x, y, z]
     if degree >= 2:
@@ -106,7 +109,7 @@ def _harmonics(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(harmonics, dim=-1)
 
 
-class _Directions(torch.autograd.Function):
+class _DirectionEncoding(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, directions: Tensor, normals: Tensor | None, degree: int, threads: int) -> Tensor:
         directions = directions.detach().contiguous()

@@ -1,7 +1,7 @@
-"""Perceptron: a chain of linear layers with ReLU between them, for many rows at once, in the compiled kernel.
+"""Multilayer perceptron: linear layers with ReLU between them, for many rows at once, in the compiled kernel.
 
-Torch runs such a chain one layer at a time and sends every activation through memory; the kernel takes a block
-of rows through all layers while they lie in cache. Knows nothing of what the rows are.
+Torch evaluates one layer at a time and writes every activation to memory; the kernel takes a block of rows through all
+layers while it is in the cache.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from graings import kernel
 
 
 class GroupBias(NamedTuple):
-    """What rows have in common: `values` are added to the first layer of the rows of a group, `groups` ascend."""
+    """A bias per group of rows, added to the first layer: row i gets `values[groups[i]]`. `groups` must ascend."""
 
     values: Float[Tensor, "group first"]
     groups: Int64[Tensor, " row"]
@@ -31,23 +31,21 @@ def perceptron(
     biases: Sequence[Float[Tensor, " _"]],
     *,
     shared: GroupBias | None = None,
-    threads: int | None = None,
 ) -> Float[Tensor, "row output"]:
-    """W_n relu(... relu(W_1 x + s + b_1) ...) + b_n for each row x; weights are [out, in] as torch's.
+    """W_n relu(... relu(W_1 x + s + b_1) ...) + b_n for each row x; weights are [out, in] as in torch.
 
-    s is the row's part of `shared`, if given. Differentiable once in everything. `threads` is the number of CPU threads
-    (None: the kernel's default); values and gradients have the same bits for any number. Raises `ValueError` for a
-    wrong shape, dtype, device or order of groups.
+    s is the row's bias of `shared`, if given. Differentiable once in all tensors. Values and gradients have the same
+    bits for any number of CPU threads. Raises `ValueError` for a wrong shape, dtype, device or order of groups.
     """
-    width, kind = inputs.shape[-1], inputs.dtype
-    if inputs.ndim != 2 or kind not in (torch.float32, torch.float64):
-        raise ValueError(f"inputs must be [row, input] in float32 or float64, got {tuple(inputs.shape)} in {kind}")
+    width, dtype = inputs.shape[-1], inputs.dtype
+    if inputs.ndim != 2 or dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"inputs must be [row, input] in float32 or float64, got {tuple(inputs.shape)} in {dtype}")
     if not weights or len(weights) != len(biases):
         raise ValueError(f"every layer needs a weight and a bias, got {len(weights)} weights and {len(biases)} biases")
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
             raise ValueError(
-                f"layer {layer} takes {width} numbers: its weight must be [out, {width}] and its bias [out], "
+                f"layer {layer} has {width} inputs: its weight must be [out, {width}] and its bias [out], "
                 f"got {tuple(weight.shape)} and {tuple(bias.shape)}"
             )
         width = weight.shape[0]
@@ -61,12 +59,9 @@ def perceptron(
                 f"got {tuple(shared.values.shape)} and {tuple(groups.shape)}"
             )
         tensors.append(shared.values)
-    if any(t.dtype != kind or t.device.type != "cpu" for t in tensors):
-        raise ValueError(f"inputs, weights, biases and shared values must all be {kind} on the CPU")
-    workers = kernel.thread_count() if threads is None else threads
-    if workers < 1:
-        raise ValueError(f"threads must be at least 1, got {workers}")
-    values: Tensor = _Perceptron.apply(workers, groups, *tensors)  # type: ignore[no-untyped-call]
+    if any(t.dtype != dtype or t.device.type != "cpu" for t in tensors):
+        raise ValueError(f"inputs, weights, biases and shared values must all be {dtype} on the CPU")
+    values: Tensor = _Perceptron.apply(kernel.thread_count(), groups, *tensors)  # type: ignore[no-untyped-call]
     return values
 
 
@@ -77,7 +72,7 @@ def plain_perceptron(
     *,
     shared: GroupBias | None = None,
 ) -> Float[Tensor, "row output"]:
-    """The oracle of `perceptron`: the same chain as torch writes it, layer by layer."""
+    """The oracle of `perceptron`: the same layers, one after the other in torch."""
     values = functional.linear(inputs, weights[0], biases[0])
     if shared is not None:
         values = values + shared.values.index_select(0, shared.groups)
@@ -87,7 +82,7 @@ def plain_perceptron(
 
 
 def weights_and_biases(layers: Iterable[nn.Module]) -> tuple[list[Tensor], list[Tensor]]:
-    """Of the linear layers among `layers`, in order."""
+    """Weights and biases of the linear layers among `layers`, in order."""
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     return [layer.weight for layer in linear], [layer.bias for layer in linear]
 
@@ -95,14 +90,14 @@ def weights_and_biases(layers: Iterable[nn.Module]) -> tuple[list[Tensor], list[
 class _Perceptron(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, threads: int, groups: Tensor | None, *tensors: Tensor) -> Tensor:
-        ready = [t.detach().contiguous() for t in tensors]
-        inputs, weights, biases, shared = _parts(ready)
+        contiguous = [t.detach().contiguous() for t in tensors]
+        inputs, weights, biases, shared = _unpacked(contiguous)
         groups = None if groups is None else groups.contiguous()
         output = inputs.new_empty(len(inputs), len(biases[-1]))
         hidden: Tensor | None = None
         if any(ctx.needs_input_grad):
             hidden = inputs.new_empty(kernel.kernel().hidden_size([inputs.shape[1], *map(len, biases)], len(inputs)))
-            ctx.save_for_backward(hidden, groups, *ready)
+            ctx.save_for_backward(hidden, groups, *contiguous)
             ctx.threads = threads
         kernel.kernel().network(inputs, weights, biases, shared, groups, output, hidden, threads)
         return output
@@ -110,18 +105,18 @@ class _Perceptron(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        hidden, groups, *ready = ctx.saved_tensors
-        inputs, weights, biases, shared = _parts(ready)
+        hidden, groups, *tensors = ctx.saved_tensors
+        inputs, weights, biases, shared = _unpacked(tensors)
         v_inputs = torch.empty_like(inputs) if ctx.needs_input_grad[2] else None
         v_shared = None if shared is None else torch.empty_like(shared)
         v_weights, v_biases = [torch.empty_like(w) for w in weights], [torch.empty_like(b) for b in biases]
-        given, gradients = (inputs, weights, biases, shared, groups), (v_inputs, v_weights, v_biases, v_shared)
-        kernel.kernel().network_gradient(*given, hidden, upstream.contiguous(), *gradients, ctx.threads)
+        layers, gradients = (inputs, weights, biases, shared, groups), (v_inputs, v_weights, v_biases, v_shared)
+        kernel.kernel().network_gradient(*layers, hidden, upstream.contiguous(), *gradients, ctx.threads)
         return None, None, v_inputs, *v_weights, *v_biases, *([] if v_shared is None else [v_shared])
 
 
-def _parts(tensors: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor], Tensor | None]:
-    """Inputs, weights, biases, and what is shared: the odd one out behind as many biases as weights."""
+def _unpacked(tensors: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor], Tensor | None]:
+    """Inputs, weights, biases and shared values from [inputs, *weights, *biases] or [..., *biases, shared values]."""
     inputs, *rest = tensors
     layers = len(rest) // 2
     return inputs, rest[:layers], rest[layers : 2 * layers], rest[-1] if len(rest) % 2 else None

@@ -1,7 +1,4 @@
-"""Scaffold: the anchors and what each of them carries (Eq. 3).
-
-Knows nothing of networks, cameras, time or pixels.
-"""
+"""Scaffold: the anchors and their learnable attributes (Eq. 3)."""
 
 from __future__ import annotations
 
@@ -13,13 +10,13 @@ from torch import Tensor, nn
 class Scaffold(nn.Module):
     """A anchors with k child slots each.
 
-    `anchors` [A, 3] and `uids` [A] are buffers: anchors sit on their voxel grid for good (decision 12), the
-    child offsets do the moving. Parameters: `log_scales` [A, 3] (log s_a, normalised units), `features`
-    [A, d_f], `offsets` [A, k, 3] (in units of s_a), `opacity_offsets` [A] (added inside the tanh of Eq. 11,
-    decision 4: the way an anchor can be born faint).
+    `anchors` [A, 3] and `uids` [A] are buffers: anchors stay on the voxel grid on which they were created, and the
+    child offsets adapt the positions. Parameters: `log_scales` [A, 3] (log s_a, normalised units), `features`
+    [A, d_f], `offsets` [A, k, 3] (epsilon of Eq. 4, in units of s_a), `opacity_offsets` [A] (added inside the tanh of
+    Eq. 11, so that a new anchor can start with low opacity although it inherits its parent's features).
     """
 
-    ROWS = ("anchors", "uids", "log_scales", "features", "offsets", "opacity_offsets")
+    ROWS = ("anchors", "uids", "log_scales", "features", "offsets", "opacity_offsets")  # tensors with a row per anchor
 
     anchors: Tensor
     uids: Tensor
@@ -52,7 +49,7 @@ class Scaffold(nn.Module):
         """Child slots per anchor k."""
         return int(self.offsets.shape[1])
 
-    def child_uids(self, children: Int64[Tensor, " drawn"]) -> Int64[Tensor, " drawn"]:
-        """Persistent birth numbers of the given flat child slots."""
+    def child_uids(self, children: Int64[Tensor, " gaussian"]) -> Int64[Tensor, " gaussian"]:
+        """Identifiers of the given flat child slots that stay the same when anchors are added, removed or reordered."""
         owners = children // self.slots
         return self.uids.index_select(0, owners) * self.slots + children % self.slots

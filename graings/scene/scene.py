@@ -1,9 +1,8 @@
-"""Scene: what was learned. Composes the Gaussians of one instant as seen from one place (Eq. 3-13).
+"""Scene: the trained model. Composes the Gaussians of one instant for one camera position (Eq. 3-5, 7 and 10-13).
 
-Opacity is evaluated first, and a score at or below 1/255 leaves no trace in the picture: only anchors with a child that
-may exceed it are asked for colours and residuals, and only children that do go through the geometry networks. This
-changes no pixel. Knows nothing of pixels, images
-or losses.
+Opacity scores are evaluated first, because the rasterizer skips scores of at most 1/255: colours and residuals are
+evaluated only for anchors with a child whose score may exceed it, the geometry networks only for children whose score
+does. The rendered image is the same as with all children.
 """
 
 from __future__ import annotations
@@ -22,20 +21,20 @@ from graings.camera.sampling_rate import SamplingRate
 from graings.config import SceneConfig
 from graings.gaussians import Gaussians
 from graings.random import torch_stream
+from graings.scene.activations import tanh
 from graings.scene.appearance import CanonicalAppearance, ResidualField
 from graings.scene.canonical import StaticMLP, default_geometry
 from graings.scene.children import Children, compose, gather
 from graings.scene.clip import clip
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP, deformation_from
-from graings.scene.saturate import tanh
 from graings.scene.scaffold import Scaffold
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Composition:
-    """What is drawn at one instant, with everything the losses and the growth statistics look at.
+    """The Gaussians of one view, with everything the losses and the growth statistics read.
 
-    Children that another view composed together with this one draws are among them.
+    They include children that only another view, composed together with this one, renders.
     """
 
     gaussians: Gaussians
@@ -43,17 +42,18 @@ class Composition:
     canonical_means: Float[Tensor, "gaussian 3"]  # x_can
     deformation: Deformation | None
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
-    opacities: Float[Tensor, "anchor child"]  # score of every slot, o(t) where it may be drawn at all; no gradient
-    blur: float  # low-pass that the Gaussians were trained to be seen with, px^2 where a view is as fine as `sampling`
+    opacities: Float[Tensor, "anchor child"]  # score of every slot, no gradient: o(t) of candidates, else o_can
+    blur: float  # variance of the low-pass filter used in training, px^2 at the sampling rate `sampling`
     sampling: SamplingRate
 
 
 class Scene(nn.Module):
-    """The model. `temporal` off (static warm-up, or a single instant) leaves the time modules unevaluated.
+    """The model: anchors and networks.
 
+    Without `temporal` (static warm-up, or a capture of one instant) no time-conditioned module is evaluated.
     `extent` is the half-size of the content in normalised units; positions enter the networks divided by it. `sampling`
-    is that of the views it is trained on: the low-pass is a part of what was learned, as large on the scene in every
-    picture, of training too. `seed` is that of the networks' first weights.
+    is the sampling rate of the training views: the low-pass filter is part of the trained model and has the same size
+    on the scene in every image. `seed` seeds the initial weights of the networks.
     """
 
     extent: Tensor
@@ -78,7 +78,7 @@ class Scene(nn.Module):
         self.single: SingleMLP | None = None
         self.static: StaticMLP | None = None
         self.deformation: DeformationNetwork | None = None
-        # Each network begins with the same weights whichever others there are: ablations differ by their part alone.
+        # The initial weights of a network do not depend on which others exist, so ablations differ in one part only.
         with torch_stream(seed, "init.appearance"):
             self.appearance = CanonicalAppearance(config, initial_opacity)
         if config.residual:
@@ -95,143 +95,151 @@ class Scene(nn.Module):
                 self.deformation = DeformationNetwork(config)
 
     def gaussians(self, eye: ArrayLike, time: float) -> Gaussians:
-        """What is drawn at `time` in [0, 1] from a camera centre `eye` [3] (normalised units)."""
+        """The Gaussians at `time` in [0, 1] for the camera centre `eye` [3] (normalised units)."""
         return self.compose(eye, time).gaussians
 
     def compose(self, eye: ArrayLike, time: float) -> Composition:
-        """As `gaussians`, with the intermediate quantities of training."""
+        """As `gaussians`, with the intermediate quantities that training needs."""
         return self.compose_together([(eye, time)])[0]
 
     def compose_together(self, views: Sequence[tuple[ArrayLike, float]]) -> list[Composition]:
-        """As `compose` for several views (eye, time), which share their children: those drawn in any of them.
+        """As `compose` for several views (eye, time); each contains the children that any of the views renders.
 
-        A child that one view would have left out has no opacity to speak of there, so no picture changes; and what does
-        not depend on the view, most of the networks' work, is done once.
+        A child that a view would skip on its own has a score of at most 1/255 there, so no image changes. Everything
+        that does not depend on the view, which is most of the networks' work, is computed once.
         """
         scaffold, config, slots = self.scaffold, self.config, self.scaffold.slots
         directions = [self.directions(eye) for eye, _ in views]
         times = [time for _, time in views]
 
-        residual = self.residual if self.temporal else None
-        lasting = self._canonical_opacities(directions)
-        active = _active_anchors(lasting, 0.0 if residual is None else residual.scale)
-        features = scaffold.features.index_select(0, active)
-        source = features.detach() if config.residual_stop_gradient else features
-        scores = [score.index_select(0, active) for score in lasting]
-        directions = [towards.index_select(0, active) for towards in directions]
-        changes: list[Tensor | None] = [None] * len(views)
-        if residual is not None:
-            changes = [
-                residual(source, torch.tensor([time], dtype=features.dtype), towards)
-                for time, towards in zip(times, directions, strict=True)
+        residual_field = self.residual if self.temporal else None
+        canonical_opacities = self._canonical_opacities(directions)
+        candidates = _candidate_anchors(canonical_opacities, 0.0 if residual_field is None else residual_field.scale)
+        features = scaffold.features.index_select(0, candidates)
+        residual_features = features.detach() if config.residual_stop_gradient else features
+        opacities = [score.index_select(0, candidates) for score in canonical_opacities]
+        directions = [direction.index_select(0, candidates) for direction in directions]
+        residuals: list[Tensor | None] = [None] * len(views)
+        if residual_field is not None:
+            residuals = [
+                residual_field(residual_features, torch.tensor([time], dtype=features.dtype), direction)
+                for time, direction in zip(times, directions, strict=True)
             ]
-            scores = [
-                score if change is None else score + residual.bounded(change[..., 3])
-                for score, change in zip(scores, changes, strict=True)
+            opacities = [
+                score if residual is None else score + residual_field.bounded(residual[..., 3])
+                for score, residual in zip(opacities, residuals, strict=True)
             ]
-        drawn_anywhere = torch.stack([score.detach() for score in scores]).amax(0).flatten() > constants.ALPHA_MIN
-        places = drawn_anywhere.nonzero().squeeze(-1)  # of what is drawn among the slots of awake anchors
-        children = active[places // slots] * slots + places % slots
+        highest = torch.stack([score.detach() for score in opacities]).amax(0).flatten()
+        rendered = (highest > constants.ALPHA_MIN).nonzero().squeeze(-1)  # among the slots of the candidates
+        slot_indices = candidates[rendered // slots] * slots + rendered % slots
 
-        drawn = gather(scaffold, children)
-        uids = scaffold.child_uids(children)
+        children = gather(scaffold, slot_indices)
+        uids = scaffold.child_uids(slot_indices)
         extent = float(self.extent)
         compositions = []
-        answers = self._predicted_geometry(drawn, children, times)
-        every = zip(lasting, scores, changes, directions, answers, strict=True)
-        for unchanged, score, change, towards, (canonical, raw) in every:
-            colors = self.appearance.colors(features, towards, places)
-            drawn_change = None
-            if residual is not None and change is not None:
-                drawn_change = residual.bounded(change.flatten(0, 1).index_select(0, places))
-                colors = clip(colors + drawn_change[:, :3], 0.0, 1.0, projected=config.projected_clip)
-            means, quats, log_scales = compose(canonical, drawn, raw, extent, projected_clip=config.projected_clip)
+        geometries = self._predicted_geometry(children, slot_indices, times)
+        per_view = zip(canonical_opacities, opacities, residuals, directions, geometries, strict=True)
+        for canonical_opacity, opacity, residual, direction, (canonical, raw) in per_view:
+            colors = self.appearance.colors(features, direction, rendered)
+            rendered_residual = None
+            if residual_field is not None and residual is not None:
+                rendered_residual = residual_field.bounded(residual.flatten(0, 1).index_select(0, rendered))
+                colors = clip(colors + rendered_residual[:, :3], 0.0, 1.0, projected=config.projected_clip)
+            means, quats, log_scales = compose(canonical, children, raw, extent, projected_clip=config.projected_clip)
             gaussians = Gaussians(
                 means=means,
                 quats=quats,
                 log_scales=log_scales,
-                opacities=score.flatten().index_select(0, places),
+                opacities=opacity.flatten().index_select(0, rendered),
                 colors=colors,
                 uids=uids,
             )
-            moved = None if raw is None else deformation_from(raw, extent)
-            opacities = unchanged.detach().index_copy(0, active, score.detach())
             compositions.append(
                 Composition(
-                    gaussians, children, drawn.centres, moved, drawn_change, opacities, config.blur, self.sampling
+                    gaussians=gaussians,
+                    children=slot_indices,
+                    canonical_means=children.canonical_means,
+                    deformation=None if raw is None else deformation_from(raw, extent),
+                    residual=rendered_residual,
+                    opacities=canonical_opacity.detach().index_copy(0, candidates, opacity.detach()),
+                    blur=config.blur,
+                    sampling=self.sampling,
                 )
             )
         return compositions
 
     def _canonical_opacities(self, directions: Sequence[Tensor]) -> list[Tensor]:
-        """Of each view: the opacity score [A, k] of every slot before the residual field has spoken."""
+        """o_can [A, k] of every slot for each view, Eq. 11."""
         offsets = self.scaffold.opacity_offsets.unsqueeze(-1)
         scores: list[Tensor] = []
-        for towards in directions:
+        for direction in directions:
             if not scores or self.config.opacity_view:
-                scores.append(tanh(self.appearance.opacity_logits(self.scaffold.features, towards) + offsets))
+                scores.append(tanh(self.appearance.opacity_logits(self.scaffold.features, direction) + offsets))
             else:
                 scores.append(scores[0])
         return scores
 
     def directions(self, eye: ArrayLike) -> Float[Tensor, "anchor 3"]:
-        """Unit vectors from the camera centre to every anchor (decision A21)."""
+        """Viewing direction v of Eq. 11: unit vectors from the camera centre `eye` [3] to every anchor."""
         anchors = self.scaffold.anchors
-        towards = anchors - torch.as_tensor(np.asarray(eye, dtype=np.float64), dtype=anchors.dtype)
-        return towards / towards.norm(dim=-1, keepdim=True).clamp_min(constants.NEAR)
+        offsets = anchors - torch.as_tensor(np.asarray(eye, dtype=np.float64), dtype=anchors.dtype)
+        return offsets / offsets.norm(dim=-1, keepdim=True).clamp_min(constants.NEAR)
 
     def deform(
         self, children: Int64[Tensor, " gaussian"], canonical_means: Float[Tensor, "gaussian 3"], time: float
     ) -> Deformation | None:
-        """Offsets at `time` of drawn children (flat slots, ascending) with the canonical positions given, Eq. 7.
+        """Offsets at `time` of rendered children (flat slots, ascending) at the given canonical positions, Eq. 7.
 
-        None while the scene is static. The gradient is stopped, or not, as the configuration says.
+        None while the scene is static. The stop-gradient of Eq. 7 is applied as configured.
         """
         if not self.temporal or (self.deformation is None and self.single is None):
             return None
         if self.single is not None:
-            raw = self._single(self.single, gather(self.scaffold, children), canonical_means, time)[:, 7:]
+            raw = self._single_mlp(self.single, gather(self.scaffold, children), canonical_means, time)[:, 7:]
         else:
             raw = self._predicted_deformation(children, canonical_means, [time])[0]
         return deformation_from(raw, float(self.extent))
 
     def _predicted_geometry(
-        self, drawn: Children, children: Tensor, times: Sequence[float]
+        self, children: Children, slot_indices: Tensor, times: Sequence[float]
     ) -> list[tuple[Tensor, Tensor | None]]:
-        """What the networks say of the drawn children at each time: canonical geometry, and its change if it moves."""
+        """Outputs of the geometry networks at each time: canonical geometry, and the deformation or None (static)."""
+        means = children.canonical_means
         if self.single is not None:
             if not self.temporal:
-                return [(self._single(self.single, drawn, drawn.centres, None)[:, :7], None)] * len(times)
-            every = [self._single(self.single, drawn, drawn.centres, time) for time in times]
-            return [(raw[:, :7], raw[:, 7:]) for raw in every]
-        canonical = (
-            default_geometry(drawn.centres) if self.static is None else self.static(self.scaffold.features, drawn)
-        )
+                return [(self._single_mlp(self.single, children, means, None)[:, :7], None)] * len(times)
+            outputs = [self._single_mlp(self.single, children, means, time) for time in times]
+            return [(output[:, :7], output[:, 7:]) for output in outputs]
+        canonical = default_geometry(means) if self.static is None else self.static(self.scaffold.features, children)
         if not self.temporal or self.deformation is None:
             return [(canonical, None)] * len(times)
-        return [(canonical, raw) for raw in self._predicted_deformation(children, drawn.centres, times)]
+        return [(canonical, raw) for raw in self._predicted_deformation(slot_indices, means, times)]
 
-    def _predicted_deformation(self, children: Tensor, canonical_means: Tensor, times: Sequence[float]) -> list[Tensor]:
-        """DeformNet's answer per child at each time, or one per anchor that all its children share."""
+    def _predicted_deformation(
+        self, slot_indices: Tensor, canonical_means: Tensor, times: Sequence[float]
+    ) -> list[Tensor]:
+        """Output of DeformNet per child at each time; with anchor deformation all children of an anchor share it."""
         assert self.deformation is not None
-        moments = torch.tensor(times, dtype=canonical_means.dtype).unsqueeze(-1)
+        time_rows = torch.tensor(times, dtype=canonical_means.dtype).unsqueeze(-1)
         if self.config.deformation == "anchor":
-            used, place = torch.unique(children // self.scaffold.slots, return_inverse=True)
-            shared = self.deformation(self.scaffold.anchors.index_select(0, used) / self.extent, moments)
-            return [raw.index_select(0, place) for raw in shared.unbind(0)]
-        return list(self.deformation(self._positions(canonical_means), moments).unbind(0))
+            anchors, owners = torch.unique(slot_indices // self.scaffold.slots, return_inverse=True)
+            shared = self.deformation(self.scaffold.anchors.index_select(0, anchors) / self.extent, time_rows)
+            return [raw.index_select(0, owners) for raw in shared.unbind(0)]
+        return list(self.deformation(self._network_positions(canonical_means), time_rows).unbind(0))
 
-    def _single(self, single: SingleMLP, drawn: Children, canonical_means: Tensor, time: float | None) -> Tensor:
-        moment = None if time is None else torch.tensor([time], dtype=canonical_means.dtype)
-        raw: Tensor = single(self.scaffold.features, drawn, self._positions(canonical_means), moment)
-        return raw
+    def _single_mlp(self, single: SingleMLP, children: Children, canonical_means: Tensor, time: float | None) -> Tensor:
+        time_row = None if time is None else torch.tensor([time], dtype=canonical_means.dtype)
+        output: Tensor = single(self.scaffold.features, children, self._network_positions(canonical_means), time_row)
+        return output
 
-    def _positions(self, canonical_means: Tensor) -> Tensor:
-        """Where a deformation network sees the children: in units of the extent, as a constant if so configured."""
+    def _network_positions(self, canonical_means: Tensor) -> Tensor:
+        """sg(x_can) of Eq. 7 in units of the extent; without the stop-gradient where so configured."""
         return (canonical_means.detach() if self.config.stop_gradient else canonical_means) / self.extent
 
 
-def _active_anchors(lasting: Sequence[Float[Tensor, "anchor child"]], reach: float) -> Int64[Tensor, " awake"]:
-    """Anchors with a child that may be drawn in one of the views: no residual adds more than `reach` to a score."""
-    highest = torch.stack([score.detach().amax(-1) for score in lasting]).amax(0)
-    return (highest + reach > constants.ALPHA_MIN).nonzero().squeeze(-1)
+def _candidate_anchors(
+    canonical_opacities: Sequence[Float[Tensor, "anchor child"]], max_residual: float
+) -> Int64[Tensor, " candidate"]:
+    """Anchors with a child that may be rendered in one of the views: |Delta o| is at most `max_residual`."""
+    highest = torch.stack([score.detach().amax(-1) for score in canonical_opacities]).amax(0)
+    return (highest + max_residual > constants.ALPHA_MIN).nonzero().squeeze(-1)

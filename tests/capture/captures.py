@@ -1,4 +1,4 @@
-"""Tiny captures written to disk by the tests, and ways to break them."""
+"""Tiny captures that tests write to disk, and ways to damage them."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def write_image(path: Path, image: NDArray[Any], stored: str | None = None) -> P
     return path
 
 
-def without_alpha(capture: Path, colour: Sequence[float] = (1.0, 1.0, 1.0)) -> Path:
-    """Lay every image of `capture` on `colour`, as files of three channels; returns `capture`."""
-    images = ImageStore(colour)
+def without_alpha(capture: Path, color: Sequence[float] = (1.0, 1.0, 1.0)) -> Path:
+    """Composite every image of `capture` on `color`, as files with three channels; returns `capture`."""
+    images = ImageStore(color)
     for _, frame in load_capture(capture, CaptureConfig(max_side=None)):
         write_image(frame.image_path, np.rint(images.rgb(frame) * 255).astype(np.uint8))
     return capture
@@ -73,7 +73,7 @@ def write_transforms(folder: Path, split: str, frames: list[dict[str, Any]], **k
 
 
 def write_dnerf(folder: Path, times: list[float] | None = None, *, radius: float = 4.0) -> Path:
-    """A sound capture of four training images (one for each time where given) of 12x12 px."""
+    """A valid capture of four training images (or one for each of `times`) of 12x12 px."""
     count = 4 if times is None else len(times)
     for index in range(count):
         write_image(folder / f"train/r_{index:03d}.png", pixels(12, 12, seed=index))
@@ -86,7 +86,7 @@ def write_dnerf(folder: Path, times: list[float] | None = None, *, radius: float
 
 
 def write_single(folder: Path, count: int = 20, *, frame: dict[str, Any] | None = None, **top: Any) -> Path:
-    """A sound capture of `count` images of 64x40 px on a ring, in one transforms.json whose frames are out of order."""
+    """A valid capture of `count` images of 64x40 px on a ring, in one transforms.json whose frames are not sorted."""
     lens = {"fl_x": 60.0, "fl_y": 62.0, "cx": 33.0, "cy": 19.0, "w": 64, "h": 40}
     frames = []
     for index in range(count):
@@ -99,7 +99,7 @@ def write_single(folder: Path, count: int = 20, *, frame: dict[str, Any] | None 
 
 
 def write_walled(folder: Path, cameras: Sequence[Camera]) -> Path:
-    """Opaque photographs of a painted floor (z = 0) that fills them, at different times; every eighth is held out."""
+    """Opaque images that a painted floor (z = 0) fills, at different times; every eighth is held out."""
     paint = np.random.default_rng(0).random((64, 64, 3))
     frames: dict[str, list[dict[str, Any]]] = {"train": [], "val": []}
     for index, camera in enumerate(cameras):
@@ -107,9 +107,9 @@ def write_walled(folder: Path, cameras: Sequence[Camera]) -> Path:
         local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         towards = local @ camera.world_to_camera[:3, :3]
         x, y, _ = np.moveaxis(camera.center - camera.center[2] / towards[..., 2:] * towards, -1, 0)
-        colours = _between(paint, 5.0 * x, 5.0 * y)
+        colors = _interpolated(paint, 5.0 * x, 5.0 * y)
         name = f"images/{index:03d}"
-        write_image(folder / f"{name}.png", np.rint(255 * colours).astype(np.uint8))
+        write_image(folder / f"{name}.png", np.rint(255 * colors).astype(np.uint8))
         frames["val" if index % 8 == 7 else "train"].append(entry(camera, name, index / len(cameras)))
     for split, entries in frames.items():
         if entries:
@@ -117,8 +117,8 @@ def write_walled(folder: Path, cameras: Sequence[Camera]) -> Path:
     return folder
 
 
-def _between(paint: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`paint` [n, n, 3], repeated for ever, at x and y, smoothly."""
+def _interpolated(paint: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`paint` [n, n, 3], repeated periodically, at x and y, smoothly interpolated."""
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
     wx, wy = (3 * w**2 - 2 * w**3 for w in ((x - left)[..., None], (y - top)[..., None]))
     above, below = (

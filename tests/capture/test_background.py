@@ -1,4 +1,4 @@
-"""The one colour around what opaque pictures show."""
+"""The background colour of opaque images."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GREY = (0.2, 0.4, 0.6)
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """A ball or two on nothing, in transparent pictures."""
+    """A few ellipsoids in images with a transparent background."""
     return write_synthetic(tmp_path / "c", seed=1, frames=6, size=24)
 
 
@@ -41,11 +41,11 @@ def _background(folder: Path, config: CaptureConfig = AUTO) -> object:
 
 
 @pytest.mark.parametrize("colour", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), GREY])
-def test_it_is_what_surrounds_the_pictures(capture: Path, colour: tuple[float, float, float]) -> None:
+def test_background_is_the_colour_of_the_image_borders(capture: Path, colour: tuple[float, float, float]) -> None:
     assert _background(without_alpha(capture, colour)) == ("white" if colour == (1.0, 1.0, 1.0) else colour)
 
 
-def test_an_alpha_channel_that_is_opaque_everywhere_does_not_hide_it(capture: Path) -> None:
+def test_an_alpha_channel_that_is_opaque_everywhere_is_ignored(capture: Path) -> None:
     without_alpha(capture, GREY)
     for _, frame in load_capture(capture):
         opaque = np.full((24, 24, 1), 255, np.uint8)
@@ -54,16 +54,16 @@ def test_an_alpha_channel_that_is_opaque_everywhere_does_not_hide_it(capture: Pa
     assert np.allclose(_background(capture), GREY, atol=1e-6)  # type: ignore[arg-type]
 
 
-def test_noise_of_compression_does_not_hide_it(capture: Path) -> None:
+def test_compression_noise_is_tolerated(capture: Path) -> None:
     without_alpha(capture, GREY)
     noise = np.random.default_rng(0)
     for frame in load_capture(capture).train:
-        seen = 255 * ImageStore((1.0, 1.0, 1.0)).rgb(frame) + noise.integers(-4, 5, (24, 24, 3))
-        write_image(frame.image_path, np.rint(seen).clip(0, 255).astype(np.uint8))
+        noisy = 255 * ImageStore((1.0, 1.0, 1.0)).rgb(frame) + noise.integers(-4, 5, (24, 24, 3))
+        write_image(frame.image_path, np.rint(noisy).clip(0, 255).astype(np.uint8))
     assert np.allclose(_background(capture), GREY, atol=1.5 / 255)  # type: ignore[arg-type]
 
 
-def test_a_picture_of_all_sorts_has_none(tmp_path: Path) -> None:
+def test_images_with_many_border_colours_have_a_white_background(tmp_path: Path) -> None:
     folder = write_dnerf(tmp_path / "c")
     for index in range(4):
         write_image(folder / f"train/r_{index:03d}.png", pixels(12, 12, 3, seed=index))
@@ -71,31 +71,31 @@ def test_a_picture_of_all_sorts_has_none(tmp_path: Path) -> None:
     assert _background(folder) == "white"
 
 
-def test_pictures_of_different_colours_have_none(capture: Path) -> None:
+def test_images_with_different_border_colours_have_a_white_background(capture: Path) -> None:
     without_alpha(capture, GREY)
     first = load_capture(capture).train[0].image_path
     write_image(first, np.zeros((24, 24, 3), np.uint8))
     assert _background(capture) == "white"
 
 
-def test_a_thing_that_reaches_over_an_edge_does_not_hide_it(capture: Path) -> None:
+def test_an_object_may_reach_over_a_border(capture: Path) -> None:
     without_alpha(capture, GREY)
     frame = load_capture(capture).train[0]
-    seen = ImageStore((1.0, 1.0, 1.0)).rgb(frame)
-    seen[:, :4] = 0
-    write_image(frame.image_path, np.rint(seen * 255).astype(np.uint8))
+    image = ImageStore((1.0, 1.0, 1.0)).rgb(frame)
+    image[:, :4] = 0
+    write_image(frame.image_path, np.rint(image * 255).astype(np.uint8))
     assert np.allclose(_background(capture), GREY, atol=1e-6)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (5, 1), (2, 2)])
-def test_the_smallest_pictures_are_all_edge(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_images_that_consist_of_borders_are_accepted(tmp_path: Path, size: tuple[int, int]) -> None:
     folder = write_dnerf(tmp_path / "c")
     for index in range(4):
         write_image(folder / f"train/r_{index:03d}.png", np.full((*size, 3), 51, np.uint8))
     assert _background(folder) == (0.2, 0.2, 0.2)
 
 
-def test_a_picture_that_cannot_be_read_is_named(capture: Path) -> None:
+def test_an_unreadable_image_is_named(capture: Path) -> None:
     data = load_capture(without_alpha(capture))
     path = data.train[0].image_path
     path.write_bytes(path.read_bytes()[:60])
@@ -103,7 +103,7 @@ def test_a_picture_that_cannot_be_read_is_named(capture: Path) -> None:
         with_background(AUTO, data)
 
 
-def test_what_the_user_says_stands_and_alpha_means_white(capture: Path) -> None:
+def test_a_configured_background_is_kept_and_transparent_borders_are_white(capture: Path) -> None:
     assert _background(capture) == "white"
     black = CaptureConfig(background="black")
     assert _background(capture, black) == "black"
@@ -111,7 +111,7 @@ def test_what_the_user_says_stands_and_alpha_means_white(capture: Path) -> None:
     assert _background(capture, black) == "black"
 
 
-def test_a_run_says_and_keeps_it(capture: Path, tmp_path: Path) -> None:
+def test_a_run_logs_and_stores_the_background(capture: Path, tmp_path: Path) -> None:
     without_alpha(capture, (0.0, 0.0, 0.0))
     config = micro_config(**{"iterations": 2})
     run = TrainingRun.create(capture, tmp_path / "run", config)

@@ -49,7 +49,7 @@ def matrix(change: Callable[[np.ndarray], Any]) -> Break:
 
 
 def as_jpeg(keep: float) -> Break:
-    """Replace the third image by a JPEG of which a share is left."""
+    """Replace the third image by a JPEG that is truncated to a fraction of its bytes."""
 
     def apply(folder: Path) -> None:
         path = write_image(folder / "train/r_002.jpg", pixels(64, 64, 3))
@@ -122,7 +122,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "time is text": (frame(time="NaN"), rf"{TRAIN}, frames\[2\]\.time: .*valid number"),
     "time is not finite": (frame(time=math.nan), rf"{TRAIN}, frames\[2\]\.time: .*finite number"),
     "time is infinite": (frame(time=-math.inf), rf"{TRAIN}, frames\[2\]\.time: .*finite number"),
-    "time is absurd": (frame(time=1e300), r"train/r_002\.png, time: is 1e\+300"),
+    "time is too large": (frame(time=1e300), r"train/r_002\.png, time: is 1e\+300"),
     "time is true": (frame(time=True), rf"{TRAIN}, frames\[2\]\.time: .*valid number"),
     "time for some only": (
         edit(lambda d: d["frames"][2].pop("time")),
@@ -132,7 +132,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
         matrix(lambda m: m.__setitem__((0, 3), math.nan)),
         rf"{TRAIN}, frames\[2\]\.transform_matrix\[0\]\[3\]: .*finite number",
     ),
-    "pose is absurd": (
+    "pose is too large": (
         matrix(lambda m: m.__setitem__((0, 3), 1e200)),
         r"train/r_002\.png, camera position: is 1e\+200",
     ),
@@ -146,14 +146,14 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "pose is singular": (matrix(flatten), rf"{TRAIN}, frames\[2\]\.transform_matrix: the rotation part is singular"),
     "pose with a wrong last row": (matrix(wreck_last_row), rf"{TRAIN}, frames\[2\]\.transform_matrix: the last row"),
     "negative focal length": (frame(fl_x=-20.0), rf"{TRAIN}, frames\[2\]\.fl_x: .*greater than 0"),
-    "an angle below the least": (frame(camera_angle_x=1e-320), rf"{TRAIN}, frames\[2\]: intrinsics must be finite"),
-    "an angle of almost nothing": (frame(camera_angle_x=1e-300), r"train/r_002.png, focal length fx: .* sizes"),
-    "a lens wider than any": (frame(fl_x=1e-9), r"train/r_002.png, focal length fx: .* sizes"),
-    "a centre far away": (frame(cx=1e308), r"train/r_002.png, principal point cx: is .* picture sizes"),
+    "an angle that overflows": (frame(camera_angle_x=1e-320), rf"{TRAIN}, frames\[2\]: intrinsics must be finite"),
+    "an angle that is too small": (frame(camera_angle_x=1e-300), r"train/r_002.png, focal length fx: .* image sizes"),
+    "a focal length that is too short": (frame(fl_x=1e-9), r"train/r_002.png, focal length fx: .* image sizes"),
+    "a principal point far away": (frame(cx=1e308), r"train/r_002.png, principal point cx: is .* image sizes"),
     "zero angle": (edit(lambda d: d.update(camera_angle_x=0.0)), rf"{TRAIN}, camera_angle_x: .*greater than 0"),
-    "angle of a half turn": (frame(camera_angle_x=math.pi), rf"{TRAIN}, frames\[2\]\.camera_angle_x: .*less than"),
+    "angle of 180 degrees": (frame(camera_angle_x=math.pi), rf"{TRAIN}, frames\[2\]\.camera_angle_x: .*less than"),
     "width of zero": (frame(w=0), rf"{TRAIN}, frames\[2\]\.w: .*greater than 0"),
-    "intrinsics for another shape": (frame(w=12, h=24), rf"{TRAIN}, frames\[2\]\.w, h: .*12x24 px.*has 12x12"),
+    "intrinsics for another aspect ratio": (frame(w=12, h=24), rf"{TRAIN}, frames\[2\]\.w, h: .*12x24 px.*has 12x12"),
     "a lens with four radial coefficients": (frame(k4=0.1), rf"{TRAIN}, frames\[2\]: a fourth radial coefficient"),
     "frame listed twice": (
         frame(file_path="train/../train/r_001.png"),
@@ -163,7 +163,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "absolute path": (frame(file_path="/etc/hostname"), rf"{TRAIN}, frames\[2\]\.file_path: .*leads outside"),
     "link to the outside": (link_outside, rf"{TRAIN}, frames\[2\]\.file_path: .*leads outside"),
     "path with a NUL": (frame(file_path="a\0b"), rf"{TRAIN}, frames\[2\]\.file_path: cannot use the path"),
-    "path without end": (frame(file_path="a" * 10_000), rf"{TRAIN}, frames\[2\]\.file_path: cannot use the path"),
+    "path that is too long": (frame(file_path="a" * 10_000), rf"{TRAIN}, frames\[2\]\.file_path: cannot use the path"),
     "train file missing": (
         lambda f: (f / TRAIN).rename(f / "transforms_test.json"),
         rf"{TRAIN}: is missing",
@@ -175,7 +175,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
 def test_broken_capture_is_refused_with_its_reason(tmp_path: Path, name: str) -> None:
     (tmp_path / "scene").mkdir()
     folder = write_dnerf(tmp_path / "scene", TIMES)
-    load_capture(folder)  # sound before it is broken
+    load_capture(folder)  # valid before it is damaged
     breaks, message = BROKEN[name]
     breaks(folder)
     with pytest.raises(CaptureError, match=f"^{message}") as caught:
@@ -191,11 +191,11 @@ def test_broken_held_out_split_is_refused_too(tmp_path: Path) -> None:
         load_capture(tmp_path)
 
 
-def test_folder_without_a_capture_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_error_for_a_folder_without_a_capture_lists_the_formats(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("nothing here")
     with pytest.raises(
         CaptureError,
-        match=r"holds no capture: neither transforms_train\.json .* nor transforms\.json .* nor a COLMAP model",
+        match=r"contains no capture: neither transforms_train\.json .* nor transforms\.json .* nor a COLMAP model",
     ):
         load_capture(tmp_path)
 
@@ -204,7 +204,7 @@ def test_folder_of_several_captures_names_them(tmp_path: Path) -> None:
     for name in ("left", "right"):
         (tmp_path / name).mkdir()
         write_dnerf(tmp_path / name)
-    with pytest.raises(CaptureError, match=r"holds several captures \(left, right\)"):
+    with pytest.raises(CaptureError, match=r"contains several captures \(left, right\)"):
         load_capture(tmp_path)
 
 

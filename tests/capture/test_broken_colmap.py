@@ -12,7 +12,7 @@ import pytest
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
-from tests.capture.captures import Break, cut, write_colmap
+from tests.capture.captures import Break, cut, pixels, write_colmap, write_image
 
 
 def patch(name: str, at: int, layout: str, *values: float) -> Break:
@@ -29,7 +29,7 @@ def patch(name: str, at: int, layout: str, *values: float) -> Break:
 CAMERAS, IMAGES, POINTS = (f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D"))
 # cameras.bin: count, then id, model, width, height, fx, fy, cx, cy. images.bin: count, then id, quaternion, ...
 BROKEN_COLMAP: dict[str, tuple[Break, str]] = {
-    "missing photograph": (
+    "missing image": (
         lambda f: (f / "images/frame_0030.png").unlink(),
         r"sparse/0, image 'frame_0030\.png': .*is missing",
     ),
@@ -41,13 +41,13 @@ BROKEN_COLMAP: dict[str, tuple[Break, str]] = {
     "truncated points3D.bin": (cut(POINTS, lambda d: d[:-5]), rf"{POINTS}: is truncated"),
     "empty cameras.bin": (cut(CAMERAS, lambda d: b""), rf"{CAMERAS}: is truncated"),
     "bytes too many": (cut(CAMERAS, lambda d: d + b"\0\0"), rf"{CAMERAS}: 2 bytes too many"),
-    "absurd count": (patch(POINTS, 0, "<Q", 2**63), rf"{POINTS}: is truncated"),
+    "count that is too large": (patch(POINTS, 0, "<Q", 2**63), rf"{POINTS}: is truncated"),
     "no images": (cut(IMAGES, lambda d: struct.pack("<Q", 0)), r"sparse/0, images: the model has no registered image"),
     "unknown camera model": (patch(CAMERAS, 12, "<i", 77), rf"{CAMERAS}: camera 1 has the unknown model 77"),
     "negative focal length": (patch(CAMERAS, 32, "<d", -30.0), rf"{CAMERAS}: camera 1 needs .*positive focal"),
     "focal length is not finite": (patch(CAMERAS, 32, "<d", math.nan), rf"{CAMERAS}: camera 1 needs finite"),
     "camera without a size": (patch(CAMERAS, 16, "<Q", 0), rf"{CAMERAS}: camera 1 has the size 0x20"),
-    "camera of another shape": (patch(CAMERAS, 16, "<Q", 50), r"sparse/0, cameras: the camera is for 50x20 px"),
+    "camera of another aspect ratio": (patch(CAMERAS, 16, "<Q", 50), r"sparse/0, cameras: the camera is for 50x20 px"),
     "missing camera": (patch(CAMERAS, 8, "<I", 5), r"sparse/0, cameras: the image .* refers to camera 1"),
     "zero rotation": (patch(IMAGES, 12, "<4d", 0, 0, 0, 0), rf"{IMAGES}, frame_0000\.png: the rotation is zero"),
     "pose is not finite": (patch(IMAGES, 44, "<d", math.inf), rf"{IMAGES}, frame_0000\.png: the pose is not finite"),
@@ -77,7 +77,7 @@ BROKEN_COLMAP: dict[str, tuple[Break, str]] = {
 @pytest.mark.parametrize("name", BROKEN_COLMAP)
 def test_broken_colmap_folder_is_refused_with_its_reason(tmp_path: Path, name: str) -> None:
     folder = write_colmap(tmp_path)
-    load_capture(folder)  # sound before it is broken
+    load_capture(folder)  # valid before it is damaged
     breaks, message = BROKEN_COLMAP[name]
     breaks(folder)
     with pytest.raises(CaptureError, match=f"^{message}") as caught:
@@ -96,11 +96,11 @@ BROKEN_TEXT: dict[str, tuple[Break, str]] = {
     ),
     "cut between images": (
         cut("sparse/0/images.txt", lambda d: b"\n".join(d.splitlines()[:10]) + b"\n"),
-        r"sparse/0/images\.txt: announces 10 entries and holds 3",
+        r"sparse/0/images\.txt: declares 10 entries and contains 3",
     ),
     "cut between points": (
         cut("sparse/0/points3D.txt", lambda d: b"\n".join(d.splitlines()[:13]) + b"\n"),
-        r"sparse/0/points3D\.txt: announces 40 entries and holds 10",
+        r"sparse/0/points3D\.txt: declares 40 entries and contains 10",
     ),
     "word for a number": (
         cut("sparse/0/cameras.txt", lambda d: d.replace(b"PINHOLE 32", b"PINHOLE wide")),
@@ -124,7 +124,14 @@ def test_lens_that_cannot_be_undistorted_is_refused(tmp_path: Path) -> None:
         load_capture(tmp_path)
 
 
-def test_distorted_capture_without_pycolmap_says_what_to_install(
+def test_focal_length_that_overflows_when_scaled_to_the_images_is_refused(tmp_path: Path) -> None:
+    write_colmap(tmp_path, count=1, params=(1.5e308, 1.5e308, 15.5, 10.5))
+    write_image(tmp_path / "images/frame_0000.png", pixels(40, 64, 3))
+    with pytest.raises(CaptureError, match=r"^sparse/0, cameras: intrinsics must be finite"):
+        load_capture(tmp_path)
+
+
+def test_error_for_a_distorted_capture_without_pycolmap_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 16.0, 10.0, 0.05))
@@ -139,10 +146,10 @@ def test_pinhole_capture_needs_no_pycolmap(tmp_path: Path, monkeypatch: pytest.M
     assert len(load_capture(tmp_path).train) == 7
 
 
-def test_names_without_numbers_give_no_times(tmp_path: Path) -> None:
+def test_name_without_a_number_is_refused_with_times_from_names(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path, text=True)
     (folder / "images/frame_0030.png").rename(folder / "images/face.png")
     path = folder / "sparse/0/images.txt"
     path.write_text(path.read_text().replace("frame_0030.png", "face.png"))
-    with pytest.raises(CaptureError, match=r"^images/face\.png, name: the file name holds no number"):
+    with pytest.raises(CaptureError, match=r"^images/face\.png, name: the file name contains no number"):
         load_capture(folder, CaptureConfig(times_from_names=True))

@@ -40,9 +40,9 @@ def test_model_is_read_as_pycolmap_wrote_it(tmp_path: Path, text: bool, where: s
         camera = frame.camera
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30.0, 31.0, 15.5, 10.5)
     assert capture.points is not None
-    found = capture.units.points_back(capture.points.positions)
+    read = capture.units.points_back(capture.points.positions)
     positions = np.array([point.xyz for point in reference.points3D.values()])
-    np.testing.assert_allclose(found[np.argsort(found[:, 0])], positions[np.argsort(positions[:, 0])], atol=1e-13)
+    np.testing.assert_allclose(read[np.argsort(read[:, 0])], positions[np.argsort(positions[:, 0])], atol=1e-13)
     np.testing.assert_array_equal(capture.points.colors, np.tile(np.float32([1, 0.2, 0]), (40, 1)))
 
 
@@ -72,16 +72,16 @@ def test_times_come_from_their_file(tmp_path: Path) -> None:
     assert times["images/frame_0030.png"] == pytest.approx(9 / 81, abs=1e-15)
 
 
-def test_times_come_from_names_when_asked(tmp_path: Path) -> None:
+def test_times_come_from_names_when_configured(tmp_path: Path) -> None:
     capture = load_capture(write_colmap(tmp_path), CaptureConfig(times_from_names=True))
     times = {frame.name: frame.time for _, frame in capture}
     assert times["images/frame_0030.png"] == pytest.approx(3 / 9, abs=1e-15)
     assert capture.units.time_span == 90.0
 
 
-def test_pinhole_pictures_are_not_resampled(tmp_path: Path) -> None:
+def test_pinhole_images_are_not_resampled(tmp_path: Path) -> None:
     capture = load_capture(write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 16.0, 10.0, 0.0)))
-    assert any(note.startswith("undistortion left out") for note in capture.notes)
+    assert any(note.startswith("images are not undistorted") for note in capture.notes)
     frame = next(frame for _, frame in capture if frame.name.endswith("0030.png"))
     assert frame.lens is None
     expected = pixels(20, 32, 3, seed=3).astype(np.float32) / np.float32(255)
@@ -90,7 +90,7 @@ def test_pinhole_pictures_are_not_resampled(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("model", "params"), DISTORTED)
 def test_undistortion_agrees_with_pycolmap(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
-    # A picture without detail finer than a pixel: pycolmap may blend neighbours in 8 bit, we do so in float.
+    # An image without detail finer than a pixel, because pycolmap may interpolate in 8 bit.
     y, x = np.mgrid[:80, :128]
     smooth = np.stack([x * 1.9, y * 3.0, 255 - x - y], axis=2).astype(np.uint8)
     write_colmap(tmp_path, count=2, model=model, params=params, size=SIZE)
@@ -105,18 +105,18 @@ def test_undistortion_agrees_with_pycolmap(tmp_path: Path, model: str, params: t
     ours = ImageStore((0.0, 0.0, 0.0)).rgb(frame) * 255
     theirs = np.asarray(image.to_array(), dtype=np.float32)
     assert ours.shape == theirs.shape
-    # Theirs is rounded or truncated to 8 bit: within one grey level wherever both look inside the photograph.
+    # Theirs is rounded or truncated to 8 bit: equal within one grey level wherever both sample inside the photo.
     np.testing.assert_allclose(ours[1:-1, 1:-1], theirs[1:-1, 1:-1], rtol=0, atol=1.01)
 
 
-def test_undistorted_points_project_where_the_lens_put_them() -> None:
+def test_undistorted_pixels_and_source_pixels_have_the_same_rays() -> None:
     lens = Lens.of(*DISTORTED[1], SIZE, DISTORTED[1][1][4:])
     assert lens is not None
-    at = lens.source_pixels()
+    positions = lens.source_pixels()
     fx, fy, cx, cy = lens.pinhole
     camera = pycolmap.Camera(model=lens.model, width=SIZE[0], height=SIZE[1], params=list(lens.params))
     for column, row in ((0, 0), (27, 13), (80, 44)):
-        ray = camera.cam_from_img(at[row, column])
+        ray = camera.cam_from_img(positions[row, column])
         np.testing.assert_allclose(ray * (fx, fy) + (cx, cy), (column + 0.5, row + 0.5), atol=1e-6)
 
 
@@ -130,7 +130,7 @@ def test_cameras_follow_images_that_were_scaled_down(tmp_path: Path) -> None:
     assert "the model's cameras were scaled to the size of 10 image files" in capture.notes
 
 
-def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
+def test_points_that_are_not_finite_are_discarded(tmp_path: Path) -> None:
     write_colmap(tmp_path, text=True)
     path = tmp_path / "sparse/0/points3D.txt"
     path.write_text(path.read_text() + "99 nan 0 0 1 2 3 0\n98 1e300 0 0 1 2 3 0\n")
@@ -141,7 +141,7 @@ def test_points_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     assert any(note.startswith("2 of 42 points") for note in capture.notes)
 
 
-def test_model_without_points_is_centred_by_its_cameras(tmp_path: Path) -> None:
+def test_model_without_points_is_centred_on_its_cameras(tmp_path: Path) -> None:
     capture = load_capture(write_colmap(tmp_path, points=0))
     assert capture.points is None
     np.testing.assert_allclose(capture.units.center, orbit(0, 1).center * 0, atol=1e-13)

@@ -20,7 +20,7 @@ from graings.errors import CaptureError
 from tests.capture.captures import pixels, write_image
 
 BLUE = (0.0, 0.25, 1.0)
-HALF_A_STEP = 0.5 / 65535  # of what is kept in 16 bits
+HALF_A_STEP = 0.5 / 65535  # rounding error of 16 bits
 
 
 def frame_of(path: Path, *, size: tuple[int, int] | None = None) -> Frame:
@@ -45,14 +45,14 @@ def test_eight_bit_opaque_pixels_are_exactly_x_over_255(tmp_path: Path) -> None:
 
 def test_straight_alpha_is_composited_on_the_background(tmp_path: Path) -> None:
     image = pixels(7, 9)
-    image[0, 0] = (200, 100, 50, 0)  # colour under alpha 0 must not show
+    image[0, 0] = (200, 100, 50, 0)  # colour under alpha 0 must not be visible
     image[0, 1] = (200, 100, 50, 255)
     store, frame = ImageStore(BLUE), frame_of(write_image(tmp_path / "a.png", image))
     rgb, alpha = store.rgb(frame), store.alpha(frame)
-    # And five float32 roundings of numbers up to 1; what is kept as the background is has its colour, half a step away.
-    error, ground = np.abs(rgb - composite(image / 255, BLUE)), rgb == np.float32(BLUE)
-    assert error[~ground].max() <= HALF_A_STEP + 5 * 2**-24
-    assert error[ground].max() <= 2 * HALF_A_STEP + 5 * 2**-24
+    # Plus five float32 roundings of numbers up to 1. Values quantized as the background become exactly the background.
+    error, background = np.abs(rgb - composite(image / 255, BLUE)), rgb == np.float32(BLUE)
+    assert error[~background].max() <= HALF_A_STEP + 5 * 2**-24
+    assert error[background].max() <= 2 * HALF_A_STEP + 5 * 2**-24
     np.testing.assert_array_equal(rgb[0, 0], np.float32(BLUE))
     np.testing.assert_array_equal(rgb[0, 1], image[0, 1, :3].astype(np.float32) / np.float32(255))
     assert alpha is not None
@@ -60,7 +60,7 @@ def test_straight_alpha_is_composited_on_the_background(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [(9, 7), (4, 3)])
-def test_alpha_that_is_opaque_everywhere_says_no_more_than_none(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_alpha_that_is_opaque_everywhere_counts_as_none(tmp_path: Path, size: tuple[int, int]) -> None:
     image = pixels(7, 9)
     image[..., 3] = 255
     opaque, plain = (write_image(tmp_path / name, each) for name, each in (("a.png", image), ("b.png", image[..., :3])))
@@ -99,7 +99,7 @@ def test_grey_becomes_rgb(tmp_path: Path, channels: int) -> None:
     np.testing.assert_allclose(rgb, np.repeat(expected[..., None], 3, axis=2), rtol=0, atol=HALF_A_STEP + 3 * 2**-24)
 
 
-def test_format_is_told_by_content_not_by_name(tmp_path: Path) -> None:
+def test_format_is_recognised_by_content_not_by_name(tmp_path: Path) -> None:
     image = pixels(7, 9, 3)
     path = write_image(tmp_path / "a.png", image).rename(tmp_path / "a.jpg")
     np.testing.assert_array_equal(ImageStore(BLUE).rgb(frame_of(path)), image.astype(np.float32) / np.float32(255))
@@ -127,10 +127,10 @@ def test_shrinking_is_the_exact_area_average(source: tuple[int, int], target: tu
             assert value == pytest.approx(float(expected), rel=2**-23)
 
 
-def test_shrinking_weighs_colour_by_alpha(tmp_path: Path) -> None:
+def test_shrinking_weights_colour_by_alpha(tmp_path: Path) -> None:
     image = np.zeros((2, 2, 4), dtype=np.uint8)
     image[0, 0] = (255, 0, 0, 255)
-    image[0, 1] = (0, 255, 0, 0)  # green that nobody can see
+    image[0, 1] = (0, 255, 0, 0)  # invisible green
     path = write_image(tmp_path / "a.png", image)
     store = ImageStore((0.0, 0.0, 0.0))
     rgb = store.rgb(frame_of(path, size=(1, 1)))[0, 0]
@@ -141,7 +141,7 @@ def test_shrinking_weighs_colour_by_alpha(tmp_path: Path) -> None:
     assert alpha[0, 0] == rgb[0]
 
 
-def test_cache_stays_within_its_limit_and_answers_from_memory(tmp_path: Path) -> None:
+def test_cache_stays_within_its_limit_and_needs_no_file(tmp_path: Path) -> None:
     store = ImageStore(BLUE, cache_mb=1)
     frames = [
         frame_of(write_image(tmp_path / f"{i}.png", pixels(210, 210, 3, seed=i))) for i in range(8)
@@ -151,8 +151,8 @@ def test_cache_stays_within_its_limit_and_answers_from_memory(tmp_path: Path) ->
         assert store.cached_bytes <= 1_000_000
     assert store.cached_bytes > 500_000
     frames[-1].image_path.unlink()
-    np.testing.assert_array_equal(store.rgb(frames[-1]), last)  # no file left to read: it came from memory
-    last[:] = 0  # the caller's own
+    np.testing.assert_array_equal(store.rgb(frames[-1]), last)  # the file is gone, so it comes from the cache
+    last[:] = 0  # a copy of the caller
     assert store.rgb(frames[-1]).any()
 
 
@@ -163,20 +163,20 @@ def test_image_larger_than_the_cache_is_still_returned(tmp_path: Path) -> None:
     assert store.cached_bytes == 0
 
 
-def test_a_frame_fetched_ahead_is_decoded_once_whatever_the_cache_holds(tmp_path: Path) -> None:
+def test_a_prefetched_frame_is_decoded_once_even_if_it_exceeds_the_cache(tmp_path: Path) -> None:
     frame = frame_of(write_image(tmp_path / "a.png", pixels(700, 700, 3)))  # more than a megabyte
     expected = ImageStore(BLUE).rgb(frame)
     store = ImageStore(BLUE, cache_mb=1)
     store.prefetch(frame)
     store.prefetch(frame)
-    store._ahead.shutdown()  # waits until it is done
+    store._prefetcher.shutdown()  # waits until it is done
     frame.image_path.unlink()
     np.testing.assert_array_equal(store.rgb(frame), expected)
-    with pytest.raises(CaptureError):  # handed out once, and neither kept nor decoded again
+    with pytest.raises(CaptureError):  # returned once, not cached, and the file is gone
         store.rgb(frame)
 
 
-def test_what_goes_wrong_ahead_is_told_to_who_wants_the_frame(tmp_path: Path) -> None:
+def test_an_error_of_prefetching_is_raised_when_the_frame_is_requested(tmp_path: Path) -> None:
     frame = frame_of(write_image(tmp_path / "a.png", pixels(7, 9)))
     frame.image_path.write_bytes(frame.image_path.read_bytes()[:-60])
     store = ImageStore(BLUE)
@@ -190,8 +190,8 @@ def test_threads_see_the_same_pixels(tmp_path: Path) -> None:
     expected = [ImageStore(BLUE).rgb(frame) for frame in frames]
     store = ImageStore(BLUE, cache_mb=1)
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(store.rgb, frames * 5))
-    for index, rgb in enumerate(found):
+        images = list(pool.map(store.rgb, frames * 5))
+    for index, rgb in enumerate(images):
         np.testing.assert_array_equal(rgb, expected[index % 6])
 
 
@@ -202,7 +202,7 @@ def test_file_that_changed_size_after_loading_is_refused(tmp_path: Path) -> None
         ImageStore(BLUE).rgb(frame)
 
 
-def test_file_that_broke_after_loading_is_refused(tmp_path: Path) -> None:
+def test_file_that_was_damaged_after_loading_is_refused(tmp_path: Path) -> None:
     frame = frame_of(write_image(tmp_path / "a.png", pixels(7, 9)))
     frame.image_path.write_bytes(frame.image_path.read_bytes()[:-60])
     with pytest.raises(CaptureError, match=r"a\.png: cannot be decoded"):
@@ -215,5 +215,5 @@ def test_huge_image_is_refused_by_its_header(tmp_path: Path) -> None:
     assert output.open(str(path), oiio.ImageSpec(20_000, 4, 1, "uint8"))
     assert output.write_image(np.zeros((4, 20_000, 1), dtype=np.uint8))
     assert output.close()
-    with pytest.raises(CaptureError, match="is 20000x4 px; at most 16384 px a side"):
+    with pytest.raises(CaptureError, match="is 20000x4 px, more than 16384 px per side"):
         check_image(path, path.name, path.read_bytes())

@@ -1,4 +1,4 @@
-"""Units: lengths by a power of two, times to [0, 1], the vertical axis."""
+"""Units: lengths scaled by a power of two, times in [0, 1], the up axis."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from graings.camera.camera import Camera
 from graings.capture.load import load_capture
-from graings.capture.normalize import frame_of_reference, vertical
+from graings.capture.normalize import center_and_scale, up_axis
 from tests.capture.captures import entry, orbit, pixels, write_dnerf, write_image, write_transforms
 
 RADIUS = 4.25  # 17 / 4: the poses below stay exact when scaled
@@ -28,7 +28,7 @@ def ring(scale: float = 1.0, offset: tuple[float, float, float] = (0.0, 0.0, 0.0
 
 
 def test_cameras_on_a_ring_centre_on_what_they_look_at() -> None:
-    center, scale, notes = frame_of_reference(ring(), None)
+    center, scale, notes = center_and_scale(ring(), None)
     np.testing.assert_allclose(center, 0.0, atol=1e-14)
     assert scale == 0.25
     assert notes == []
@@ -37,8 +37,8 @@ def test_cameras_on_a_ring_centre_on_what_they_look_at() -> None:
 @pytest.mark.parametrize("exponent", [-13, -3, 3, 10, 17])
 def test_capture_scaled_by_a_power_of_two_has_the_same_bits(exponent: int) -> None:
     factor = 2.0**exponent
-    center, scale, _ = frame_of_reference(ring(), None)
-    scaled_center, scaled_scale, _ = frame_of_reference(ring(factor), None)
+    center, scale, _ = center_and_scale(ring(), None)
+    scaled_center, scaled_scale, _ = center_and_scale(ring(factor), None)
     assert scaled_scale == scale / factor
     np.testing.assert_array_equal(scaled_center, center * factor)
 
@@ -48,13 +48,13 @@ def test_capture_scaled_by_a_power_of_two_has_the_same_bits(exponent: int) -> No
 )
 def test_scale_brings_the_radius_within_a_factor_of_root_two(radius: float) -> None:
     points = radius * np.concatenate([np.eye(3), -np.eye(3)])
-    _, scale, _ = frame_of_reference(ring(1e-9), points)
+    _, scale, _ = center_and_scale(ring(1e-9), points)
     assert 2**-0.5 * (1 - 1e-12) <= scale * radius <= 2**0.5 * (1 + 1e-12)
 
 
 def test_far_from_the_origin_the_centre_follows() -> None:
     offset = (5e5, 4e6, 300.0)
-    center, scale, _ = frame_of_reference(ring(offset=offset), None)
+    center, scale, _ = center_and_scale(ring(offset=offset), None)
     np.testing.assert_allclose(center, offset, atol=1e-8)  # float64 spacing at 4e6 is 9e-10
     assert scale == 0.25
 
@@ -62,14 +62,14 @@ def test_far_from_the_origin_the_centre_follows() -> None:
 def test_outliers_among_the_points_do_not_move_the_centre() -> None:
     points = np.random.default_rng(0).normal(size=(200, 3))
     points[:10] = 1e6
-    center, scale, _ = frame_of_reference(ring(), points)
+    center, scale, _ = center_and_scale(ring(), points)
     assert np.abs(center).max() < 0.3
     assert scale == 0.25
 
 
 def test_one_camera_has_no_scale() -> None:
     camera = ring()[0]
-    center, scale, notes = frame_of_reference([camera] * 8, None)
+    center, scale, notes = center_and_scale([camera] * 8, None)
     np.testing.assert_allclose(center, camera.center + camera.forward, atol=1e-15)
     assert scale == 1.0
     assert [note.partition(":")[0] for note in notes] == ["no_scale"]
@@ -81,7 +81,7 @@ def test_parallel_axes_have_no_parallax_but_keep_their_scale() -> None:
         pose = np.eye(4)
         pose[0, 3] = -x
         cameras.append(Camera(pose, 10.0, 10.0, 5.0, 5.0, 10, 10))
-    center, scale, notes = frame_of_reference(cameras, None)
+    center, scale, notes = center_and_scale(cameras, None)
     np.testing.assert_allclose(center[:2], 0.0, atol=1e-15)
     assert center[2] > 0
     assert 0.1 < scale * 3.0 < 1.0
@@ -93,25 +93,25 @@ def test_cameras_looking_outwards_are_centred_on_themselves() -> None:
         Camera.look_at(point, 2 * point, fov=0.7, width=8, height=8)
         for point in (np.array([math.cos(a), math.sin(a), 0.0]) for a in np.arange(5) * 2 * math.pi / 5)
     ]
-    center, _, notes = frame_of_reference(cameras, None)
+    center, _, notes = center_and_scale(cameras, None)
     assert np.linalg.norm(center) < 1.0
     assert notes == ["the cameras look outwards: the scene is centred on the cameras"]
 
 
-def test_level_cameras_give_an_exact_vertical_axis() -> None:
+def test_level_cameras_give_an_exact_up_axis() -> None:
     # Seen from one side only and from above, the mean camera up leans by far more than ten degrees.
     cameras = [Camera.orbit(a, 50.0, 4.0, fov=0.7, width=8, height=8) for a in (0.0, 20.0, 40.0)]
-    assert vertical(cameras) == (0.0, 0.0, 1.0)
+    assert up_axis(cameras) == (0.0, 0.0, 1.0)
 
 
-def test_tilted_vertical_axis_is_kept() -> None:
+def test_tilted_up_axis_is_kept() -> None:
     up = np.array([0.0, 0.6, 0.8])
     cameras = [Camera.orbit(a, 20.0, 4.0, up=up, fov=0.7, width=8, height=8) for a in range(0, 360, 30)]
-    np.testing.assert_allclose(vertical(cameras), up, atol=1e-12)
+    np.testing.assert_allclose(up_axis(cameras), up, atol=1e-12)
 
 
 @pytest.mark.parametrize(
-    "stamps",
+    "times",
     [
         [0.0, 0.5, 1.0],
         [5.0, 6.0, 9.0, 7.0],
@@ -121,34 +121,34 @@ def test_tilted_vertical_axis_is_kept() -> None:
     ],
     ids=["unit", "from five", "negative", "epoch seconds", "epoch milliseconds"],
 )
-def test_times_are_mapped_to_the_unit_interval_in_double_precision(tmp_path: Path, stamps: list[float]) -> None:
-    capture = load_capture(write_dnerf(tmp_path, stamps))
-    low, high = Fraction(min(stamps)), Fraction(max(stamps))
-    for frame, stamp in zip(capture.train, stamps, strict=True):
-        assert frame.time == pytest.approx(float((Fraction(stamp) - low) / (high - low)), abs=1e-12)
-    assert len(capture.times) == len(stamps)
+def test_times_are_mapped_to_the_unit_interval_in_double_precision(tmp_path: Path, times: list[float]) -> None:
+    capture = load_capture(write_dnerf(tmp_path, times))
+    low, high = Fraction(min(times)), Fraction(max(times))
+    for frame, time in zip(capture.train, times, strict=True):
+        assert frame.time == pytest.approx(float((Fraction(time) - low) / (high - low)), abs=1e-12)
+    assert len(capture.times) == len(times)
     assert capture.times[0] == 0.0
     assert capture.times[-1] == 1.0
 
 
 def test_order_of_frames_does_not_change_their_times(tmp_path: Path) -> None:
-    stamps = [0.3, 7.0, 1.1, 5.2]
+    times = [0.3, 7.0, 1.1, 5.2]
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
-    forward = {frame.time for frame in load_capture(write_dnerf(tmp_path / "a", stamps)).train}
-    assert {frame.time for frame in load_capture(write_dnerf(tmp_path / "b", stamps[::-1])).train} == forward
+    forward = {frame.time for frame in load_capture(write_dnerf(tmp_path / "a", times)).train}
+    assert {frame.time for frame in load_capture(write_dnerf(tmp_path / "b", times[::-1])).train} == forward
 
 
-def test_stamps_closer_than_a_millionth_of_the_range_are_one_instant(tmp_path: Path) -> None:
+def test_times_closer_than_a_millionth_of_the_range_are_one_instant(tmp_path: Path) -> None:
     capture = load_capture(write_dnerf(tmp_path, [0.0, 1.0, 1.0 + 1e-9, 1.0, 2.0 - 1e-9, 2.0]))
     assert capture.times.tolist() == [0.0, pytest.approx(0.5, abs=1e-9), 1.0]
 
 
-def test_chain_of_close_stamps_does_not_collapse(tmp_path: Path) -> None:
+def test_chain_of_close_times_does_not_collapse(tmp_path: Path) -> None:
     for index in range(6):
         write_image(tmp_path / f"train/{index}.png", pixels(12, 12, seed=index))
-    stamps = [0.0, 0.8e-6, 1.6e-6, 2.4e-6, 3.2e-6, 1.0]
-    write_transforms(tmp_path, "train", [entry(orbit(i, 6), f"train/{i}", stamps[i]) for i in range(6)])
+    times = [0.0, 0.8e-6, 1.6e-6, 2.4e-6, 3.2e-6, 1.0]
+    write_transforms(tmp_path, "train", [entry(orbit(i, 6), f"train/{i}", times[i]) for i in range(6)])
     assert load_capture(tmp_path).times.tolist() == [0.0, 1.6e-6, 3.2e-6, 1.0]
 
 

@@ -1,4 +1,4 @@
-"""Vertices of PLY files, and files that are no such thing."""
+"""Vertices of PLY files, and errors for invalid files."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 from graings.capture.readers.ply import read_ply
 from graings.errors import CaptureError
 
-PLACE = "property float x\nproperty double y\nproperty float z\n"
+POSITION = "property float x\nproperty double y\nproperty float z\n"
 COLOR = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
 
 
-def header(order: str, count: int, properties: str = PLACE + COLOR, rest: str = "") -> bytes:
+def header(order: str, count: int, properties: str = POSITION + COLOR, rest: str = "") -> bytes:
     """A header with `count` vertices."""
     text = f"ply\nformat {order} 1.0\ncomment end of talk\nelement vertex {count}\n{properties}{rest}end_header\n"
     return text.encode()
@@ -45,7 +45,7 @@ def test_lines_may_end_as_on_windows() -> None:
 
 
 def test_points_without_colours_are_grey() -> None:
-    positions, colors = read_ply("a.ply", header("ascii", 1, PLACE) + b"1 2 3")
+    positions, colors = read_ply("a.ply", header("ascii", 1, POSITION) + b"1 2 3")
     np.testing.assert_array_equal(positions, [[1, 2, 3]])
     np.testing.assert_array_equal(colors, np.full((1, 3), 0.5, dtype=np.float32))
 
@@ -53,33 +53,33 @@ def test_points_without_colours_are_grey() -> None:
 @pytest.mark.parametrize(
     ("kind", "value", "expected"), [("ushort", "13107", 0.2), ("float", "0.2", 0.2), ("float", "7", 1.0)]
 )
-def test_colours_are_out_of_the_largest_of_their_type(kind: str, value: str, expected: float) -> None:
-    file = header("ascii", 1, PLACE + COLOR.replace("uchar", kind)) + f"0 0 0 {value} 0 0".encode()
+def test_integer_colours_are_divided_by_the_maximum_of_their_type(kind: str, value: str, expected: float) -> None:
+    file = header("ascii", 1, POSITION + COLOR.replace("uchar", kind)) + f"0 0 0 {value} 0 0".encode()
     np.testing.assert_allclose(read_ply("a.ply", file)[1][0], [expected, 0, 0], rtol=1e-6)
 
 
-def test_no_vertex_is_no_point() -> None:
+def test_no_vertices_give_no_points() -> None:
     assert read_ply("a.ply", header("ascii", 0))[0].shape == (0, 3)
 
 
 BROKEN = {
     "empty": (b"", "is no PLY file"),
-    "cut header": (TEXT[:40], "is no PLY file, or cut"),
+    "truncated header": (TEXT[:40], "is no PLY file, or truncated"),
     "unknown format": (TEXT.replace(b"ascii", b"runes"), "line 'format runes 1.0'"),
-    "no format": (TEXT.replace(b"format ascii 1.0\n", b""), "does not say its format"),
+    "no format": (TEXT.replace(b"format ascii 1.0\n", b""), "does not declare its format"),
     "faces first": (TEXT.replace(b"element vertex", b"element face 1\nelement vertex"), "does not begin with vertices"),
     "a list in a vertex": (TEXT.replace(b"uchar red", b"list uchar int red"), "vertex property 'property list"),
     "twice the same": (TEXT.replace(b"uchar green", b"uchar red"), "vertex property 'property uchar red'"),
     "no z": (TEXT.replace(b"float z", b"float w"), "without x, y and z"),
-    "too many announced": (TEXT.replace(b"vertex 2", b"vertex 3"), "announces 3 vertices and has 2"),
-    "far too many announced": (TEXT.replace(b"vertex 2", b"vertex 99999999999999"), "announces 9+ vertices"),
-    "a short row": (TEXT.replace(b" 102", b""), "has 5 numbers for 6 in vertex 1"),
-    "a word": (TEXT.replace(b"102", b"red"), "something else than its numbers in vertex 1"),
-    "a colour beyond its type": (TEXT.replace(b"102", b"256"), "something else than its numbers in vertex 1"),
-    "a cut binary": (header("binary_little_endian", 1) + b"\0" * 18, "announces 1 vertices"),
-    "an endless binary": (header("binary_little_endian", 10**18) + b"\0" * 18, "announces 1"),
+    "too many declared": (TEXT.replace(b"vertex 2", b"vertex 3"), "declares 3 vertices and contains 2"),
+    "far too many declared": (TEXT.replace(b"vertex 2", b"vertex 99999999999999"), "declares 9+ vertices"),
+    "a short row": (TEXT.replace(b" 102", b""), "has 5 numbers instead of 6 in vertex 1"),
+    "a word": (TEXT.replace(b"102", b"red"), "a value that does not fit its type in vertex 1"),
+    "a colour beyond its type": (TEXT.replace(b"102", b"256"), "a value that does not fit its type in vertex 1"),
+    "a truncated binary": (header("binary_little_endian", 1) + b"\0" * 18, "declares 1 vertices"),
+    "a binary that declares far too many": (header("binary_little_endian", 10**18) + b"\0" * 18, "declares 1"),
     "a colour that is not finite": (
-        header("ascii", 1, PLACE + COLOR.replace("uchar", "float")) + b"0 0 0 nan 0 0",
+        header("ascii", 1, POSITION + COLOR.replace("uchar", "float")) + b"0 0 0 nan 0 0",
         "colours that are not finite",
     ),
 }

@@ -23,7 +23,7 @@ def numbers(capture: Any, split: str) -> list[int]:
     return [int(frame.name[-9:-4]) for frame in capture.split(split)]
 
 
-def test_images_are_held_out_by_name_as_of_a_colmap_model(tmp_path: Path) -> None:
+def test_images_are_held_out_by_name_as_in_a_colmap_model(tmp_path: Path) -> None:
     capture = load_capture(write_single(tmp_path))
     assert capture.kind == "transforms"
     assert numbers(capture, "test") == [0, 8, 16]
@@ -38,7 +38,7 @@ def test_images_are_held_out_by_name_as_of_a_colmap_model(tmp_path: Path) -> Non
 
 
 def rig(folder: Path, cameras: int, instants: int, **top: Any) -> Path:
-    """`cameras` that stay in place; image i is of camera i % cameras at time i // cameras."""
+    """A rig of `cameras` fixed cameras; image i is of camera i % cameras at time i // cameras."""
     write_single(folder, cameras * instants, **top)
     document = json.loads((folder / "transforms.json").read_text())
     for frame in document["frames"]:
@@ -55,17 +55,17 @@ def test_of_a_rig_whole_cameras_are_held_out(tmp_path: Path) -> None:
     assert cameras == {"train": {1, 2, 3, 4, 6, 7}, "val": {5}, "test": {0, 8}}
     assert [len(capture.split(split)) for split in ("train", "val", "test")] == [18, 3, 6]
     assert "no split is given: every 8th camera by name is held out for test (6 images)" in capture.notes
-    assert "of the other cameras every 8th is held out for val (3 images)" in capture.notes
+    assert "every 8th of the other cameras is held out for val (3 images)" in capture.notes
 
 
-def test_of_few_cameras_none_is_given_up_and_what_stands_once_is_no_rig(tmp_path: Path) -> None:
+def test_few_cameras_or_cameras_with_one_image_are_no_rig(tmp_path: Path) -> None:
     assert numbers(load_capture(rig(tmp_path / "few", 5, 4)), "test") == [0, 8, 16]
     assert numbers(load_capture(rig(tmp_path / "once", 20, 1)), "test") == [0, 8, 16]
     short = load_capture(rig(tmp_path / "short", 5, 4), CaptureConfig(test_every=4))
     assert {number % 5 for number in numbers(short, "test")} == {0, 4}
 
 
-def test_splits_that_the_file_lists_are_taken(tmp_path: Path) -> None:
+def test_splits_that_the_file_lists_are_used(tmp_path: Path) -> None:
     name = "images/frame_{:05d}.png".format
     write_single(
         tmp_path,
@@ -76,16 +76,16 @@ def test_splits_that_the_file_lists_are_taken(tmp_path: Path) -> None:
     )
     capture = load_capture(tmp_path)
     assert [numbers(capture, split) for split in ("train", "val", "test")] == [[1, 2, 3, 4], [6], [4, 7]]
-    assert "1 of 2 test images are training images too" in capture.notes
-    assert "4 images that no split lists are left out" in capture.notes
+    assert "1 of 2 test images are also training images" in capture.notes
+    assert "4 images that no split lists are not used" in capture.notes
 
 
-def test_what_is_not_held_out_by_a_list_is_trained_on(tmp_path: Path) -> None:
+def test_images_that_no_list_holds_out_are_trained_on(tmp_path: Path) -> None:
     capture = load_capture(write_single(tmp_path, 6, test_filenames=["images/frame_00002.png"]))
     assert [numbers(capture, split) for split in ("train", "val", "test")] == [[0, 1, 3, 4, 5], [], [2]]
 
 
-def test_times_come_from_names_where_asked_for_and_none_is_given(tmp_path: Path) -> None:
+def test_times_come_from_names_when_configured_and_the_file_gives_none(tmp_path: Path) -> None:
     write_single(tmp_path, 11)
     assert load_capture(tmp_path).times.tolist() == [0.0]
     capture = load_capture(tmp_path, CaptureConfig(times_from_names=True))
@@ -126,24 +126,24 @@ def test_a_lens_of_the_frame_wins_over_that_of_the_file(tmp_path: Path) -> None:
     assert all(frame.lens is None for _, frame in capture)
 
 
-def test_points_of_its_ply_file_begin_the_training(tmp_path: Path) -> None:
+def test_points_are_those_of_the_ply_file(tmp_path: Path) -> None:
     header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {axis}\n" for axis in "xyz")
     header += "".join(f"property uint8 {color}\n" for color in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / "sparse_pc.ply").write_text(header + "0 0 0.5 255 0 51\n0.25 0 0 0 0 0\nnan 0 0 1 2 3\n")
     capture = load_capture(write_single(tmp_path, ply_file_path="sparse_pc.ply"))
     assert capture.points is not None
-    found = capture.units.points_back(capture.points.positions)
-    np.testing.assert_allclose(found, [[0, 0, 0.5], [0.25, 0, 0]], atol=1e-15)
+    points = capture.units.points_back(capture.points.positions)
+    np.testing.assert_allclose(points, [[0, 0, 0.5], [0.25, 0, 0]], atol=1e-15)
     np.testing.assert_array_equal(capture.points.colors, np.float32([[1, 0, 0.2], [0, 0, 0]]))
-    assert "1 of 3 points are not finite or absurdly far and left out" in capture.notes
+    assert "1 of 3 points are discarded: not finite or beyond 1e+15" in capture.notes
 
 
-def test_masks_are_said_to_be_unused(tmp_path: Path) -> None:
+def test_a_note_says_that_masks_are_not_used(tmp_path: Path) -> None:
     notes = load_capture(write_single(tmp_path, 4, frame={"mask_path": "masks/0.png"})).notes
     assert any(note.startswith("masks are not used (4 frames") for note in notes)
 
 
-def test_files_of_splits_and_colmap_models_come_first(tmp_path: Path) -> None:
+def test_files_per_split_and_colmap_models_take_precedence(tmp_path: Path) -> None:
     write_single(tmp_path, 4)
     (tmp_path / "transforms.json").write_text("not even JSON")
     write_colmap(tmp_path)
@@ -161,13 +161,16 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "no frames": (top(frames=[]), r"transforms\.json, frames: has no frames"),
     "another kind of camera": (
         top(camera_model="EQUIRECTANGULAR"),
-        r"transforms\.json, frames\[0\]: the camera model EQUIRECTANGULAR is not read",
+        r"transforms\.json, frames\[0\]: the camera model EQUIRECTANGULAR is not supported",
     ),
     "tangential fisheye": (
         top(is_fisheye=True, p1=0.1),
         r"transforms\.json, frames\[0\]: a fisheye lens with tangential distortion",
     ),
-    "a lens beyond use": (top(k1=-5.0), r"transforms\.json, frames\[0\]: the camera OPENCV .* cannot be undistorted"),
+    "a lens that cannot be undistorted": (
+        top(k1=-5.0),
+        r"transforms\.json, frames\[0\]: the camera OPENCV .* cannot be undistorted",
+    ),
     "an unknown name in a split": (
         top(val_filenames=["images/frame_00003.png", "images/other.png"]),
         r"transforms\.json, val_filenames\[1\]: the image 'images/other\.png' is missing",
@@ -180,7 +183,7 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         top(train_filenames=[], test_filenames=["images/frame_00001.png"]),
         r"transforms\.json, train_filenames: leaves no training image",
     ),
-    "points that are not there": (top(ply_file_path="gone.ply"), r"gone\.ply: is missing"),
+    "points file that is missing": (top(ply_file_path="gone.ply"), r"gone\.ply: is missing"),
     "points outside": (top(ply_file_path="../gone.ply"), r"transforms\.json, ply_file_path: .*leads outside"),
     "time for some only": (
         lambda document: document["frames"][1].update(time=0.5),
@@ -193,7 +196,7 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 def test_broken_file_is_refused_with_its_reason(tmp_path: Path, name: str) -> None:
     folder = write_single(tmp_path / "scene", 4)
     write_image(folder / "spare.png", pixels(40, 64, 3))
-    load_capture(folder)  # sound before it is broken
+    load_capture(folder)  # valid before it is damaged
     change, message = BROKEN[name]
     document = json.loads((folder / "transforms.json").read_text())
     change(document)
@@ -203,10 +206,10 @@ def test_broken_file_is_refused_with_its_reason(tmp_path: Path, name: str) -> No
     assert caught.value.remedy
 
 
-def test_name_without_a_number_is_refused_where_times_are_asked_of_names(tmp_path: Path) -> None:
+def test_name_without_a_number_is_refused_with_times_from_names(tmp_path: Path) -> None:
     write_single(tmp_path, 4)
     (tmp_path / "images/frame_00002.png").rename(tmp_path / "images/last.png")
     path = tmp_path / "transforms.json"
     path.write_text(path.read_text().replace("frame_00002", "last"))
-    with pytest.raises(CaptureError, match=r"^images/last\.png, name: the file name holds no number"):
+    with pytest.raises(CaptureError, match=r"^images/last\.png, name: the file name contains no number"):
         load_capture(tmp_path, CaptureConfig(times_from_names=True))

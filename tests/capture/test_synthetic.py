@@ -1,4 +1,4 @@
-"""The synthetic scene is where its formulas say, and its captures read back exactly."""
+"""Rendered bodies of the synthetic scene match their formulas, and its captures are read back exactly."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graings.capture.synthetic import SyntheticScene, write_synthetic
 FOV = 0.69
 
 
-def test_body_is_drawn_where_its_centre_projects() -> None:
+def test_body_is_rendered_where_its_centre_projects() -> None:
     scene = SyntheticScene.random(seed=4, bodies=1)
     for time in (0.0, 0.37, 1.0):
         camera = Camera.orbit(40.0 + 200 * time, 30.0, 4.0, fov=FOV, width=96, height=64)
@@ -24,8 +24,8 @@ def test_body_is_drawn_where_its_centre_projects() -> None:
         rows, columns = np.mgrid[:64, :96] + 0.5
         centroid = np.array([(alpha * columns).sum(), (alpha * rows).sum()]) / alpha.sum()
         projected = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
-        # An ellipsoid of radius r at distance d is drawn off its centre's projection by about f (r/d)^2 tan(angle):
-        # here 135 px * 0.01 * 0.3 = 0.4 px.
+        # The image of an ellipsoid of radius r at distance d is off its centre's projection by about
+        # f (r/d)^2 tan(angle): here 135 px * 0.01 * 0.3 = 0.4 px.
         np.testing.assert_allclose(centroid, projected, atol=0.5)
 
 
@@ -46,7 +46,7 @@ def test_silhouette_of_a_ball_is_exact() -> None:
     assert image[0, 0].tolist() == [0.0, 0.0, 0.0, 0.0]
 
 
-def test_bodies_move_turn_squash_and_change_colour() -> None:
+def test_bodies_move_rotate_deform_and_change_colour() -> None:
     scene = SyntheticScene.random(seed=0, bodies=3)
     for body in scene.bodies:
         assert np.linalg.norm(body.center(0.25) - body.center(0.75)) > 0.1
@@ -84,7 +84,7 @@ def test_written_capture_reads_back_exactly(tmp_path: Path) -> None:
         pose = capture.units.camera_back(frame.camera)
         camera = Camera(pose, *(getattr(frame.camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")))
         exact = scene.image(camera, frame.time)
-        # Colour and alpha are each rounded to 8 bit; the pose's way through the file moves nothing visible.
+        # Colour and alpha are each rounded to 8 bit; rounding of the pose in the file has no visible effect.
         np.testing.assert_allclose(black.rgb(frame), exact[..., :3] * exact[..., 3:], atol=1.01 / 255)
 
 
@@ -96,7 +96,7 @@ def test_same_seed_writes_the_same_capture_and_another_seed_another(tmp_path: Pa
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-def test_nothing_to_draw_is_misuse(tmp_path: Path) -> None:
+def test_a_scene_without_bodies_or_frames_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="bodies must be at least 1"):
         write_synthetic(tmp_path, bodies=0)
     with pytest.raises(ValueError, match="frames and size must be at least 1"):

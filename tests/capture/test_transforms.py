@@ -1,4 +1,4 @@
-"""The transforms reader: layouts in the wild, cameras, times, splits."""
+"""The transforms reader: layouts of known programs, cameras, times, splits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def one_frame(folder: Path, size: tuple[int, int] = (12, 12), *, top: dict[str, 
 
 
 @pytest.mark.parametrize("style", ["./train/r_{:03d}", "train/r_{:03d}", "./train/r_{:03d}.png", "train/r_{:03d}.png"])
-def test_file_path_comes_with_or_without_extension_and_dot(tmp_path: Path, style: str) -> None:
+def test_file_path_may_lack_extension_and_dot(tmp_path: Path, style: str) -> None:
     write_dnerf(tmp_path, TIMES)
     frames = [entry(orbit(i, 4), style.format(i), TIMES[i]) for i in range(4)]
     write_transforms(tmp_path, "train", frames)
@@ -106,7 +106,7 @@ def test_three_splits_share_one_time_axis(tmp_path: Path) -> None:
     assert (capture.units.time_start, capture.units.time_span) == (1.0, 4.0)
 
 
-def test_strays_of_known_datasets_are_ignored(tmp_path: Path) -> None:
+def test_stray_files_of_known_datasets_are_ignored(tmp_path: Path) -> None:
     write_dnerf(tmp_path)
     plain = load_capture(tmp_path)
     (tmp_path / "train/transforms.json").write_text("not even JSON")
@@ -115,7 +115,7 @@ def test_strays_of_known_datasets_are_ignored(tmp_path: Path) -> None:
     assert load_capture(tmp_path).content_hash == plain.content_hash
 
 
-def test_folder_around_the_capture_is_entered(tmp_path: Path) -> None:
+def test_folder_that_contains_the_capture_is_accepted(tmp_path: Path) -> None:
     (tmp_path / "scene").mkdir()
     write_dnerf(tmp_path / "scene")
     (tmp_path / "__MACOSX").mkdir()
@@ -124,7 +124,7 @@ def test_folder_around_the_capture_is_entered(tmp_path: Path) -> None:
     assert capture.train[0].name == "train/r_000.png"
 
 
-def test_content_hash_depends_on_contents_and_not_on_place(tmp_path: Path) -> None:
+def test_content_hash_depends_on_contents_and_not_on_the_path(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         (tmp_path / name).mkdir()
         write_dnerf(tmp_path / name)
@@ -139,18 +139,18 @@ def test_content_hash_depends_on_contents_and_not_on_place(tmp_path: Path) -> No
 def test_held_out_images_that_are_trained_on_are_noted(tmp_path: Path) -> None:
     write_dnerf(tmp_path)
     write_transforms(tmp_path, "val", [entry(orbit(0, 4), "train/r_000")])
-    assert "1 of 1 val images are training images too" in load_capture(tmp_path).notes
+    assert "1 of 1 val images are also training images" in load_capture(tmp_path).notes
 
 
 def test_capture_is_loaded_without_decoding(tmp_path: Path) -> None:
     write_dnerf(tmp_path)
     capture = load_capture(tmp_path)
     (tmp_path / "train/r_000.png").unlink()
-    assert len(capture.train) == 4  # frames stand; only asking for the missing pixels fails
+    assert len(capture.train) == 4  # only requesting the pixels of the missing file fails
     assert ImageStore((1.0, 1.0, 1.0)).rgb(capture.train[1]).shape == (12, 12, 3)
 
 
-def test_unpacked_archive_reads_as_the_folder(tmp_path: Path) -> None:
+def test_unpacked_archive_is_read_as_the_folder(tmp_path: Path) -> None:
     (tmp_path / "scene").mkdir()
     write_dnerf(tmp_path / "scene", TIMES)
     archive = tmp_path / "scene.zip"

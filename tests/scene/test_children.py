@@ -1,4 +1,4 @@
-"""The two operators around the networks: equal to plain torch, same bits on any number of threads, clear refusals."""
+"""`gather` and `compose`: equal to their oracles, same bits for any number of threads, clear errors for misuse."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor
 
 from graings import kernel
 from graings.scene.children import (
-    LOG_SCALE_BOUND,
     LOG_SCALE_RANGE,
+    MAX_LOG_SCALE_OFFSET,
     Children,
     compose,
     gather,
@@ -24,7 +24,7 @@ from graings.scene.scaffold import Scaffold
 
 SLOTS = 3
 
-Answers = tuple[Tensor, Children, Tensor | None]
+NetworkOutputs = tuple[Tensor, Children, Tensor | None]
 
 
 def scaffold(anchors: int, dtype: torch.dtype = torch.float64) -> Scaffold:
@@ -33,33 +33,33 @@ def scaffold(anchors: int, dtype: torch.dtype = torch.float64) -> Scaffold:
     return Scaffold(*(torch.randn(shape, generator=random, dtype=torch.float64).to(dtype) for shape in shapes))
 
 
-def some(anchors: int, share: float = 0.4) -> Tensor:
+def random_slots(anchors: int, share: float = 0.4) -> Tensor:
     return (torch.rand(anchors * SLOTS, generator=torch.Generator().manual_seed(7)) < share).nonzero().squeeze(-1)
 
 
-def answers(drawn: int, dtype: torch.dtype, *, moves: bool) -> Answers:
-    """Some log-scales beyond both bounds, one quaternion without direction."""
-    random = torch.Generator().manual_seed(drawn)
+def network_outputs(count: int, dtype: torch.dtype, *, moves: bool) -> NetworkOutputs:
+    """Outputs with some log-scales beyond both bounds and one zero quaternion."""
+    random = torch.Generator().manual_seed(count)
 
     def numbers(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=random, dtype=torch.float64).to(dtype)
 
-    canonical, moved = numbers(drawn, 7), numbers(drawn, 10) * 2
+    canonical, deformation = numbers(count, 7), numbers(count, 10) * 2
     canonical[0, :4] = torch.tensor([-1.0, 0.0, 0.0, 0.0])
     canonical[1, 4:], canonical[2, 4:] = 9.0, -30.0
     return (
         canonical,
-        Children(torch.arange(drawn), numbers(drawn, 1), numbers(drawn, 3), numbers(drawn, 3)),
-        moved if moves else None,
+        Children(torch.arange(count), numbers(count, 1), numbers(count, 3), numbers(count, 3)),
+        deformation if moves else None,
     )
 
 
 def gathered(function: Callable[..., Children], given: Scaffold, children: Tensor) -> list[Tensor]:
-    """Values and gradients for a fixed random upstream."""
+    """Values and gradients for a fixed random upstream gradient."""
     for parameter in given.parameters():
         parameter.grad = None
     result = function(given, children)
-    values = [result.inputs, result.centres, result.log_scales]
+    values = [result.inputs, result.canonical_means, result.anchor_log_scales]
     random = torch.Generator().manual_seed(3)
     upstream = [torch.randn(v.shape, generator=random, dtype=torch.float64).to(v.dtype) for v in values]
     torch.autograd.backward(values, upstream)
@@ -67,27 +67,31 @@ def gathered(function: Callable[..., Children], given: Scaffold, children: Tenso
     return [*(v.detach() for v in values), given.log_scales.grad, given.offsets.grad]  # type: ignore[list-item]
 
 
-def composed(function: Callable[..., tuple[Tensor, ...]], given: Answers, *, projected: bool = True) -> list[Tensor]:
-    canonical, children, moved = given
-    leaves = [t.clone().requires_grad_() for t in (canonical, children.log_scales, children.centres)]
-    if moved is not None:
-        leaves.append(moved.clone().requires_grad_())
-    drawn = Children(children.anchors, children.inputs, leaves[2], leaves[1])
-    values = function(leaves[0], drawn, leaves[3] if moved is not None else None, 1.7, projected_clip=projected)
+def composed(
+    function: Callable[..., tuple[Tensor, ...]], given: NetworkOutputs, *, projected: bool = True
+) -> list[Tensor]:
+    canonical, children, deformation = given
+    inputs = (canonical, children.anchor_log_scales, children.canonical_means)
+    leaves = [t.clone().requires_grad_() for t in inputs]
+    if deformation is not None:
+        leaves.append(deformation.clone().requires_grad_())
+    copies = Children(children.anchors, children.inputs, leaves[2], leaves[1])
+    offsets = leaves[3] if deformation is not None else None
+    values = function(leaves[0], copies, offsets, 1.7, projected_clip=projected)
     random = torch.Generator().manual_seed(4)
     upstream = [torch.randn(v.shape, generator=random, dtype=torch.float64).to(v.dtype) for v in values]
     return [*(v.detach() for v in values), *torch.autograd.grad(values, leaves, upstream)]
 
 
 def assert_close(ours: list[Tensor], plain: list[Tensor], relative: float) -> None:
-    for one, other in zip(ours, plain, strict=True):
-        assert (one - other).norm() <= relative * other.norm()
+    for value, expected in zip(ours, plain, strict=True):
+        assert (value - expected).norm() <= relative * expected.norm()
 
 
 @pytest.mark.parametrize(("dtype", "relative"), [(torch.float64, 1e-14), (torch.float32, 1e-6)])
 @pytest.mark.parametrize("anchors", [1, 40, 1500])
 def test_gather_equals_plain_torch(anchors: int, dtype: torch.dtype, relative: float) -> None:
-    children = some(anchors, 0.7)
+    children = random_slots(anchors, 0.7)
     assert_close(
         gathered(gather, scaffold(anchors, dtype), children),
         gathered(plain_gather, scaffold(anchors, dtype), children),
@@ -99,29 +103,29 @@ def test_gather_equals_plain_torch(anchors: int, dtype: torch.dtype, relative: f
 @pytest.mark.parametrize("projected", [True, False])
 @pytest.mark.parametrize("moves", [True, False])
 def test_compose_equals_plain_torch(moves: bool, projected: bool, dtype: torch.dtype, relative: float) -> None:
-    given = answers(3000, dtype, moves=moves)
+    given = network_outputs(3000, dtype, moves=moves)
     ours, plain = (composed(f, given, projected=projected) for f in (compose, plain_compose))
-    # A quaternion without direction has a derivative of 1e12 in its first row: compared apart, it would hide the rest.
+    # The zero quaternion has derivatives of 1e12, which would hide all others in the norm: they need only be finite.
     for values in (ours, plain):
         assert values[3][0, :4].isfinite().all()
         values[3][0, :4] = 0
     assert_close(ours, plain, relative)
 
 
-def test_bounds_hold() -> None:
-    _, _, log_scales = compose(*answers(50, torch.float32, moves=True), 1.0, projected_clip=True)
+def test_log_scales_stay_within_their_bounds() -> None:
+    _, _, log_scales = compose(*network_outputs(50, torch.float32, moves=True), 1.0, projected_clip=True)
     assert log_scales.min() >= LOG_SCALE_RANGE[0]
     assert log_scales.max() <= LOG_SCALE_RANGE[1]
-    still = Children(torch.zeros(1, dtype=torch.int64), torch.zeros(1, 1), torch.zeros(1, 3), torch.zeros(1, 3))
-    moved = torch.tensor([[0.0] * 7 + [3.0, 0.5, -9.0]])
-    _, _, change = compose(torch.zeros(1, 7), still, moved, 1.0, projected_clip=True)
-    assert torch.equal(change, torch.tensor([[LOG_SCALE_BOUND, 0.5, -LOG_SCALE_BOUND]]))
+    child = Children(torch.zeros(1, dtype=torch.int64), torch.zeros(1, 1), torch.zeros(1, 3), torch.zeros(1, 3))
+    deformation = torch.tensor([[0.0] * 7 + [3.0, 0.5, -9.0]])
+    _, _, log_scales = compose(torch.zeros(1, 7), child, deformation, 1.0, projected_clip=True)
+    assert torch.equal(log_scales, torch.tensor([[MAX_LOG_SCALE_OFFSET, 0.5, -MAX_LOG_SCALE_OFFSET]]))
 
 
-def test_a_nan_is_not_hidden_by_a_bound() -> None:
-    canonical, children, moved = answers(5, torch.float32, moves=True)
+def test_a_nan_is_not_hidden_by_a_clip() -> None:
+    canonical, children, deformation = network_outputs(5, torch.float32, moves=True)
     canonical[3] = torch.nan
-    means, quats, log_scales = compose(canonical, children, moved, 1.0, projected_clip=True)
+    means, quats, log_scales = compose(canonical, children, deformation, 1.0, projected_clip=True)
     assert quats[3].isnan().all()
     assert log_scales[3].isnan().all()
     assert means.isfinite().all()
@@ -129,9 +133,9 @@ def test_a_nan_is_not_hidden_by_a_bound() -> None:
 
 def test_gradcheck_passes() -> None:
     given = scaffold(6)
-    children = some(6, 0.6)
+    children = random_slots(6, 0.6)
     random = torch.Generator().manual_seed(1)
-    moved = torch.randn(len(children), 10, generator=random, dtype=torch.float64) * 0.3
+    deformation = torch.randn(len(children), 10, generator=random, dtype=torch.float64) * 0.3
     canonical = torch.randn(len(children), 7, generator=random, dtype=torch.float64) * 0.3
 
     def through(*values: Tensor) -> tuple[Tensor, ...]:
@@ -139,10 +143,11 @@ def test_gradcheck_passes() -> None:
         for name, value in zip(("log_scales", "offsets"), values, strict=False):
             delattr(holder, name)
             setattr(holder, name, value)
-        drawn = gather(holder, children)
-        return (*compose(values[2], drawn, values[3], 1.3, projected_clip=False), drawn.inputs)
+        gathered_children = gather(holder, children)
+        geometry = compose(values[2], gathered_children, values[3], 1.3, projected_clip=False)
+        return (*geometry, gathered_children.inputs)
 
-    leaves = [t.detach().clone().requires_grad_() for t in (given.log_scales, given.offsets, canonical, moved)]
+    leaves = [t.detach().clone().requires_grad_() for t in (given.log_scales, given.offsets, canonical, deformation)]
     assert torch.autograd.gradcheck(through, leaves)
 
 
@@ -152,35 +157,35 @@ def test_any_number_of_threads_gives_the_same_bits() -> None:
         kernel.set_threads(threads)
         results.append(
             [
-                *gathered(gather, scaffold(9000, torch.float32), some(9000)),
-                *composed(compose, answers(9000, torch.float32, moves=True)),
+                *gathered(gather, scaffold(9000, torch.float32), random_slots(9000)),
+                *composed(compose, network_outputs(9000, torch.float32, moves=True)),
             ]
         )
     kernel.set_threads(None)
-    assert all(torch.equal(one, many) for one, many in zip(*results, strict=True))
+    assert all(torch.equal(single, parallel) for single, parallel in zip(*results, strict=True))
 
 
-def test_children_out_of_order_or_range_are_refused() -> None:
+def test_children_out_of_order_or_out_of_range_are_refused() -> None:
     for wrong in ([2, 1], [1, 1], [-1], [12]):
         with pytest.raises(ValueError, match="ascending order"):
             gather(scaffold(4), torch.tensor(wrong))
 
 
-def test_nothing_drawn_gives_nothing_and_no_gradient() -> None:
+def test_no_children_give_no_values_and_zero_gradients() -> None:
     values = gathered(gather, scaffold(4), torch.zeros(0, dtype=torch.int64))
     assert all(len(v) == 0 for v in values[:3])
     assert all(not v.any() for v in values[3:])
 
 
-def test_child_centres_follow_anchor_scale_and_offset() -> None:
+def test_canonical_means_are_anchor_plus_scale_times_offset() -> None:
     given, children = scaffold(20), torch.tensor([0, 4, 59])
-    for row, child in zip(gather(given, children).centres, children.tolist(), strict=True):
+    for row, child in zip(gather(given, children).canonical_means, children.tolist(), strict=True):
         anchor, slot = divmod(child, SLOTS)
         expected = given.anchors[anchor] + given.log_scales[anchor].exp() * given.offsets[anchor, slot]
         torch.testing.assert_close(row, expected, rtol=1e-15, atol=1e-15)
 
 
-def test_quaternion_product_is_rotation_after_rotation() -> None:
+def test_quaternion_product_composes_rotations() -> None:
     half = math.sqrt(0.5)
     about_x, about_y = torch.tensor([[half, half, 0, 0]]), torch.tensor([[half, 0, half, 0]])
     assert torch.allclose(quaternion_product(about_x, about_y), torch.tensor([[0.5, 0.5, 0.5, 0.5]]), atol=1e-7)

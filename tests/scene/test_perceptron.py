@@ -1,14 +1,16 @@
-"""The compiled chain of layers: equal to torch, within a derived bound in float32, same bits on any thread count."""
+"""The compiled perceptron: equal to torch, within a derived bound in float32, same bits for any number of threads."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import pytest
 import torch
 from torch import Tensor
 
+from graings import kernel
 from graings.scene.perceptron import GroupBias, perceptron, plain_perceptron
 
 UNIT_ROUNDOFF = 2.0**-24  # float32
@@ -31,7 +33,7 @@ class Chain:
 
 
 def chain(widths: tuple[int, ...], rows: int, seed: int = 0) -> Chain:
-    """Weights of the usual spread, all numbers exact in float32."""
+    """Weights of the usual initial variance; all numbers are exact in float32."""
     random = torch.Generator().manual_seed(seed + rows + 1000 * len(widths))
     pairs = list(itertools.pairwise(widths))
     weights = [torch.randn(out, width, generator=random) / width**0.5 for width, out in pairs]
@@ -43,14 +45,21 @@ def upstream(rows: int, width: int) -> Tensor:
     return torch.randn(rows, width, generator=torch.Generator().manual_seed(5)).double()
 
 
-def differentiate(
-    function: object, given: Chain, v_output: Tensor, threads: int | None = None
-) -> tuple[Tensor, list[Tensor]]:
+def differentiate(function: Callable[..., Tensor], given: Chain, v_output: Tensor) -> tuple[Tensor, list[Tensor]]:
     leaves = [leaf.clone().requires_grad_() for leaf in given.leaves()]
     depth = len(given.weights)
-    options = {} if threads is None else {"threads": threads}
-    values = function(leaves[0], leaves[1 : depth + 1], leaves[depth + 1 :], **options)  # type: ignore[operator]
+    values = function(leaves[0], leaves[1 : depth + 1], leaves[depth + 1 :])
     return values.detach(), list(torch.autograd.grad(values, leaves, v_output.to(values.dtype)))
+
+
+def with_threads(counts: tuple[int, ...]) -> Iterator[int]:
+    """The counts, each while the kernel uses as many threads."""
+    try:
+        for count in counts:
+            kernel.set_threads(count)
+            yield count
+    finally:
+        kernel.set_threads(None)
 
 
 @pytest.mark.parametrize("widths", CHAINS)
@@ -70,9 +79,9 @@ def gamma(terms: int) -> float:
 
 
 def bounds(given: Chain, v_output: Tensor) -> tuple[Tensor, list[Tensor], Tensor]:
-    """Rounding error of values and gradients by running the chain on magnitudes (standard forward analysis).
+    """Bounds on the rounding errors of values and gradients (standard forward analysis on magnitudes), and a mask.
 
-    Third: rows no hidden unit of which is so near zero that rounding could switch it.
+    The mask marks rows in which no hidden unit is so near zero that rounding could switch its ReLU.
     """
     levels, errors = [given.inputs], [torch.zeros_like(given.inputs)]
     steady = torch.ones(len(given.inputs), dtype=torch.bool)
@@ -124,22 +133,22 @@ def test_gradcheck_passes() -> None:
 @pytest.mark.parametrize("threads", [2, 3, 8])
 def test_any_number_of_threads_gives_the_same_bits(threads: int) -> None:
     given, v_output = chain(CHAINS[0], 3000).to(torch.float32), upstream(3000, 10)
-    one, many = (differentiate(perceptron, given, v_output, count) for count in (1, threads))
-    assert torch.equal(one[0], many[0])
-    assert all(torch.equal(a, b) for a, b in zip(one[1], many[1], strict=True))
+    single, parallel = (differentiate(perceptron, given, v_output) for _ in with_threads((1, threads)))
+    assert torch.equal(single[0], parallel[0])
+    assert all(torch.equal(a, b) for a, b in zip(single[1], parallel[1], strict=True))
 
 
 def in_groups(rows: int, mean: int, width: int) -> GroupBias:
-    """Groups of about `mean` rows, some of none."""
+    """Groups of about `mean` rows; some are empty."""
     random = torch.Generator().manual_seed(rows + mean)
     count = max(1, 2 * rows // mean)
     groups = (torch.rand(rows, generator=random) * count).long().sort().values
     return GroupBias(torch.randn(count, width, generator=random, dtype=torch.float64), groups)
 
 
-@pytest.mark.parametrize("mean", [2, 7, 5000])  # children of an anchor; more than a piece of work holds
+@pytest.mark.parametrize("mean", [2, 7, 5000])  # as children of an anchor; larger than a block of rows
 @pytest.mark.parametrize("rows", [1, 513, 3000])
-def test_what_rows_share_is_added_to_their_first_layer(rows: int, mean: int, isa: str) -> None:
+def test_shared_values_are_added_to_the_first_layer(rows: int, mean: int, isa: str) -> None:
     given, v_output = chain((5, 33, 17, 2), rows), upstream(rows, 2)
     values, groups = in_groups(rows, mean, 33)
     results = []
@@ -154,14 +163,14 @@ def test_what_rows_share_is_added_to_their_first_layer(rows: int, mean: int, isa
 def test_shared_values_have_the_same_bits_for_any_number_of_threads() -> None:
     given, (values, groups) = chain((5, 33, 2), 3000).to(torch.float32), in_groups(3000, 7, 33)
     results = []
-    for threads in (1, 3):
+    for _ in with_threads((1, 3)):
         leaf = values.float().requires_grad_()
-        output = perceptron(given.inputs, given.weights, given.biases, shared=GroupBias(leaf, groups), threads=threads)
+        output = perceptron(given.inputs, given.weights, given.biases, shared=GroupBias(leaf, groups))
         results.append(torch.autograd.grad(output.sin().sum(), leaf)[0])
     assert torch.equal(*results)
 
 
-def test_groups_out_of_order_or_range_are_refused() -> None:
+def test_groups_out_of_order_or_out_of_range_are_refused() -> None:
     given = chain((4, 6, 3), 3)
     for wrong in ([1, 0, 1], [0, 1, 2], [-1, 0, 0]):
         with pytest.raises(ValueError, match="groups must ascend"):
@@ -180,7 +189,7 @@ def test_groups_out_of_order_or_range_are_refused() -> None:
         )
 
 
-def test_a_row_does_not_see_its_neighbours(isa: str) -> None:
+def test_rows_do_not_influence_each_other(isa: str) -> None:
     given = chain(CHAINS[0], 200).to(torch.float32)
     order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
     values = perceptron(given.inputs, given.weights, given.biases)
@@ -200,13 +209,11 @@ def test_no_rows_give_no_values_and_zero_gradients() -> None:
     assert all(not gradient.any() for gradient in gradients)
 
 
-def test_misuse_is_named() -> None:
+def test_misuse_is_refused_with_its_reason() -> None:
     given = chain((4, 6, 3), 5)
-    with pytest.raises(ValueError, match="layer 1 takes 6 numbers"):
+    with pytest.raises(ValueError, match="layer 1 has 6 inputs"):
         perceptron(given.inputs, [given.weights[0], given.weights[0]], given.biases)
     with pytest.raises(ValueError, match="needs a weight and a bias"):
         perceptron(given.inputs, given.weights, given.biases[:1])
     with pytest.raises(ValueError, match=r"must all be torch\.float64"):
         perceptron(given.inputs, given.weights, [b.float() for b in given.biases])
-    with pytest.raises(ValueError, match="threads must be at least 1"):
-        perceptron(given.inputs, given.weights, given.biases, threads=0)

@@ -1,4 +1,4 @@
-"""Highlights: the viewing direction mirrored at a learned normal, and the colour head that sees it."""
+"""Highlights: the viewing direction reflected at a learned normal, as an input of the colour head."""
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ import torch
 from graings import kernel
 from graings.config import SceneConfig
 from graings.scene.appearance import CanonicalAppearance
-from graings.scene.encoding import direction_encoding, direction_width, mirrored, plain_direction_encoding
+from graings.scene.encoding import direction_encoding, direction_width, plain_direction_encoding, reflected
 
 
 def _units(rows: int, seed: int) -> torch.Tensor:
@@ -14,9 +14,9 @@ def _units(rows: int, seed: int) -> torch.Tensor:
     return vectors / vectors.norm(dim=-1, keepdim=True)
 
 
-def test_mirrored_is_the_law_of_reflection() -> None:
+def test_reflected_directions_obey_the_law_of_reflection() -> None:
     directions, normals = _units(500, 1), _units(500, 2)
-    out = mirrored(directions, 7.0 * normals)
+    out = reflected(directions, 7.0 * normals)
     # Same length, opposite angle to the normal, same plane; the epsilon is 1e-6 of a squared length of 49.
     torch.testing.assert_close(out.norm(dim=-1), torch.ones(500, dtype=torch.float64), rtol=0, atol=1e-7)
     torch.testing.assert_close((out * normals).sum(-1), -(directions * normals).sum(-1), rtol=0, atol=1e-7)
@@ -24,74 +24,74 @@ def test_mirrored_is_the_law_of_reflection() -> None:
     torch.testing.assert_close((out * triple).sum(-1), torch.zeros(500, dtype=torch.float64), rtol=0, atol=1e-12)
 
 
-def test_a_normal_of_no_length_mirrors_nothing_and_its_gradient_is_finite() -> None:
+def test_a_normal_of_zero_length_reflects_nothing_and_its_gradient_is_finite() -> None:
     directions = _units(4, 3).float()
     scales = torch.tensor([[0.0], [1e-30], [1e-3], [1e18]])
     vectors = (scales * _units(4, 4).float()).requires_grad_()
-    out = mirrored(directions, vectors)
+    out = reflected(directions, vectors)
     assert torch.equal(out[:2], directions[:2])
-    # Between, at a squared length of the epsilon, half of the reflection: no longer than what came in.
+    # At a squared length equal to the epsilon half of the reflection is applied: the result is never longer than 1.
     assert (out.norm(dim=-1) <= 1 + 1e-6).all()
     (gradient,) = torch.autograd.grad(out.sum(), vectors)
     assert gradient.isfinite().all()
 
 
-def test_mirrored_has_the_gradient_of_differences() -> None:
+def test_gradcheck_of_reflected_passes() -> None:
     vectors = (2.0 * _units(6, 5)).requires_grad_()
     directions = _units(6, 6).requires_grad_()
-    assert torch.autograd.gradcheck(mirrored, (directions, vectors))
+    assert torch.autograd.gradcheck(reflected, (directions, vectors))
 
 
 def test_colour_depends_on_the_normal_only_where_reflection_is_on() -> None:
     features = torch.randn(5, 8, generator=torch.Generator().manual_seed(7))
     directions, children = _units(5, 8).float(), torch.arange(5 * 3)
-    with_it = CanonicalAppearance(SceneConfig(children=3, feature_dim=8, reflection=True), 0.1)
+    with_reflection = CanonicalAppearance(SceneConfig(children=3, feature_dim=8, reflection=True), 0.1)
     without = CanonicalAppearance(SceneConfig(children=3, feature_dim=8, reflection=False), 0.1)
     assert without.normal is None
-    assert with_it.normal is not None
-    before = with_it.colors(features, directions, children)
+    assert with_reflection.normal is not None
+    before = with_reflection.colors(features, directions, children)
     with torch.no_grad():
-        with_it.normal.bias += 1.0
-    assert not torch.equal(with_it.colors(features, directions, children), before)
-    with_it.colors(features, directions, children).sum().backward()
-    assert with_it.normal.weight.grad is not None
-    assert with_it.normal.weight.grad.abs().sum() > 0
+        with_reflection.normal.bias += 1.0
+    assert not torch.equal(with_reflection.colors(features, directions, children), before)
+    with_reflection.colors(features, directions, children).sum().backward()
+    assert with_reflection.normal.weight.grad is not None
+    assert with_reflection.normal.weight.grad.abs().sum() > 0
 
 
-def test_surfaces_that_mirror_the_same_direction_look_alike_to_the_harmonics_of_it() -> None:
-    """Two views mirrored at two normals into one direction are one input: what a highlight learned, all learn."""
+def test_surfaces_that_reflect_the_same_direction_have_the_same_input() -> None:
+    """Views reflected at different normals into one direction share a highlight: the colour head sees one direction."""
     target = _units(1, 9)
     views = _units(20, 10)
-    normals = target - views  # the mirror that turns each view into the target
-    torch.testing.assert_close(mirrored(views, 10 * normals), target.expand(20, 3), rtol=0, atol=1e-5)
+    normals = target - views  # of the plane that reflects each view into the target
+    torch.testing.assert_close(reflected(views, 10 * normals), target.expand(20, 3), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_kernel_says_of_directions_and_mirrors_what_torch_says(degree: int, dtype: torch.dtype) -> None:
+def test_kernel_encodes_directions_and_reflections_as_torch_does(degree: int, dtype: torch.dtype) -> None:
     lengths = torch.logspace(-6, 6, 3000, dtype=torch.float64).unsqueeze(-1)
     directions, normals = _units(3000, 11).to(dtype), (lengths * _units(3000, 12)).to(dtype).requires_grad_()
     encoded = direction_encoding(directions, degree, normals)
     plain_normals = normals.detach().double().requires_grad_()
     expected = plain_direction_encoding(directions.double(), degree, plain_normals)
-    # Numbers up to 3, computed in float64 by both: each may be off by a unit in the last place of what it is kept in.
+    # Numbers up to 3, computed in float64 by both and rounded to `dtype`: each may differ in the last place.
     torch.testing.assert_close(encoded.double(), expected, rtol=0, atol=4 * torch.finfo(dtype).eps)
     assert torch.equal(direction_encoding(directions, degree), encoded[:, : direction_width(degree)])
     upstream = torch.randn(expected.shape, dtype=dtype, generator=torch.Generator().manual_seed(13))
     (gradient,) = torch.autograd.grad(encoded, normals, upstream)
     (expected_gradient,) = torch.autograd.grad(expected, plain_normals, upstream.double())
-    # A gradient is as large as 1 / |n| until a normal fades; its terms cancel where it is smaller.
+    # A gradient has the size 1 / |n| down to the length at which reflections fade out; below, its terms cancel.
     size = lengths / (lengths.square() + 1e-6)
     assert ((gradient - expected_gradient).abs() <= 100 * torch.finfo(dtype).eps * size).all()
 
 
-def test_encoded_directions_have_the_gradient_of_differences_in_both() -> None:
+def test_gradcheck_of_direction_encoding_passes_for_both_inputs() -> None:
     normals, directions = (2.0 * _units(6, 14)).requires_grad_(), _units(6, 15)
     assert torch.autograd.gradcheck(lambda n: direction_encoding(directions, 3, n), (normals,))
     assert torch.autograd.gradcheck(lambda d, n: direction_encoding(d, 3, n), (directions.requires_grad_(), normals))
 
 
-def test_encoded_directions_are_the_same_for_any_number_of_threads() -> None:
+def test_encoded_directions_have_the_same_bits_for_any_number_of_threads() -> None:
     directions, normals = _units(5000, 16).float(), _units(5000, 17).float()
 
     def run(threads: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,4 +1,4 @@
-"""The model: Eq. 3-13 of the paper, one sentence a test."""
+"""The model: Eq. 3-5, 7 and 9-13 of the paper."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from torch.nn import functional
 
 from graings import constants, kernel
+from graings.scene.canonical import INITIAL_SCALE
 from graings.scene.clip import clip
 from graings.scene.encoding import (
     direction_encoding,
@@ -22,17 +23,17 @@ from tests.models import EYE, tiny_scene
 
 
 def test_untrained_deformation_and_residual_are_identity() -> None:
-    active = tiny_scene(active=False, temporal=True).compose(EYE, 0.7)
-    static = tiny_scene(active=False, temporal=False).compose(EYE, 0.7)
-    assert torch.equal(active.gaussians.means, static.gaussians.means)
-    assert torch.equal(active.gaussians.log_scales, static.gaussians.log_scales)
-    assert torch.equal(active.gaussians.colors, static.gaussians.colors)
-    assert torch.equal(active.gaussians.opacities, static.gaussians.opacities)
-    assert torch.allclose(active.gaussians.quats, static.gaussians.quats, atol=1e-7)
+    dynamic = tiny_scene(trained=False, temporal=True).compose(EYE, 0.7).gaussians
+    static = tiny_scene(trained=False, temporal=False).compose(EYE, 0.7).gaussians
+    assert torch.equal(dynamic.means, static.means)
+    assert torch.equal(dynamic.log_scales, static.log_scales)
+    assert torch.equal(dynamic.colors, static.colors)
+    assert torch.equal(dynamic.opacities, static.opacities)
+    assert torch.allclose(dynamic.quats, static.quats, atol=1e-7)
 
 
-def test_gradient_of_canonical_mean_is_bitwise_that_of_the_moved_mean() -> None:
-    # Eq. 9: with the stop-gradient dL/dx_can = dL/dx(t), nothing else.
+def test_gradient_of_canonical_mean_has_the_bits_of_that_of_the_deformed_mean() -> None:
+    # Eq. 9: with the stop-gradient dL/dx_can = dL/dx(t).
     composition = tiny_scene().compose(EYE, 0.4)
     composition.canonical_means.retain_grad()
     composition.gaussians.means.retain_grad()
@@ -53,15 +54,15 @@ def test_without_stop_gradient_the_deformation_reaches_the_canonical_mean() -> N
 def test_deformation_sends_no_gradient_to_the_scaffold() -> None:
     scene = tiny_scene()
     composition = scene.compose(EYE, 0.4)
-    moved = composition.deformation
-    assert moved is not None
-    moved.offsets.sum().backward()
+    deformation = composition.deformation
+    assert deformation is not None
+    deformation.offsets.sum().backward()
     assert all(parameter.grad is None for parameter in scene.scaffold.parameters())
     assert scene.deformation is not None
     assert scene.deformation.out.weight.grad is not None
 
 
-def test_residual_sends_no_gradient_to_the_features_unless_asked() -> None:
+def test_residual_sends_no_gradient_to_the_features_unless_configured() -> None:
     for stop, expected in ((True, None), (False, torch.Tensor)):
         scene = tiny_scene(residual_stop_gradient=stop)
         residual = scene.compose(EYE, 0.4).residual
@@ -81,15 +82,15 @@ def test_static_scene_evaluates_no_temporal_module() -> None:
     assert all(parameter.grad is None for parameter in scene.deformation.parameters())
 
 
-def test_only_children_above_one_grey_level_are_drawn() -> None:
+def test_only_children_above_one_grey_level_are_rendered() -> None:
     scene = tiny_scene()
     with torch.no_grad():
         scene.scaffold.opacity_offsets.normal_(std=0.5)
     composition = scene.compose(EYE, 0.4)
-    drawn = composition.opacities.flatten() > constants.ALPHA_MIN
-    assert 0 < int(drawn.sum()) < drawn.numel()
-    assert torch.equal(composition.children, drawn.nonzero().squeeze(-1))
-    assert torch.equal(composition.gaussians.opacities, composition.opacities.flatten()[drawn])
+    rendered = composition.opacities.flatten() > constants.ALPHA_MIN
+    assert 0 < int(rendered.sum()) < rendered.numel()
+    assert torch.equal(composition.children, rendered.nonzero().squeeze(-1))
+    assert torch.equal(composition.gaussians.opacities, composition.opacities.flatten()[rendered])
 
 
 def test_residual_is_bounded_by_eta() -> None:
@@ -104,7 +105,7 @@ def test_residual_is_bounded_by_eta() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_residual_of_colour_sees_the_view_as_configured_and_that_of_opacity_never(degree: int) -> None:
+def test_residual_of_colour_depends_on_the_view_as_configured_and_that_of_opacity_never(degree: int) -> None:
     scene = tiny_scene(residual_sh_degree=degree)
     here, there = (scene.compose(eye, 0.4) for eye in (EYE, [-x for x in EYE]))
     assert torch.equal(here.children, there.children)
@@ -115,31 +116,60 @@ def test_residual_of_colour_sees_the_view_as_configured_and_that_of_opacity_neve
     assert float(differs[:3].amax()) > 1e-3 if degree > 0 else float(differs[:3].amax()) == 0.0
 
 
-def test_each_child_moves_by_itself_and_broadcast_moves_anchors_whole() -> None:
+def test_children_move_independently_unless_deformation_is_per_anchor() -> None:
     for mode, spread in (("child", True), ("anchor", False)):
         composition = tiny_scene(deformation=mode).compose(EYE, 0.4)
-        moved = composition.deformation.position.detach()
+        offsets = composition.deformation.position.detach()
         owners = composition.children // 3
         varies = any(
-            not torch.allclose(moved[owners == anchor], moved[owners == anchor][:1], atol=1e-7)
+            not torch.allclose(offsets[owners == anchor], offsets[owners == anchor][:1], atol=1e-7)
             for anchor in owners.unique()
         )
         assert varies is spread
 
 
+GEOMETRY, APPEARANCE = ("means", "quats", "log_scales"), ("opacities", "colors")
+
+
 @pytest.mark.parametrize(
-    "ablation", [{"single_mlp": True}, {"canonical": False}, {"residual": False}, {"deformation": "none"}]
+    ("ablation", "networks", "constant"),
+    [
+        ({}, {"static", "deformation", "residual"}, ()),
+        ({"single_mlp": True}, {"single", "residual"}, ()),
+        ({"canonical": False}, {"deformation", "residual"}, ()),
+        ({"residual": False}, {"static", "deformation"}, APPEARANCE),
+        ({"deformation": "none"}, {"static", "residual"}, GEOMETRY),
+    ],
+    ids=str,
 )
-def test_every_structural_ablation_gives_finite_gaussians_and_gradients(ablation: dict[str, object]) -> None:
+def test_a_structural_ablation_removes_its_networks_and_all_others_are_trained(
+    ablation: dict[str, object], networks: set[str], constant: tuple[str, ...]
+) -> None:
     scene = tiny_scene(**ablation)
-    gaussians = scene.compose(EYE, 0.4).gaussians
-    (gaussians.means.sum() + gaussians.quats.sum() + gaussians.log_scales.sum() + gaussians.colors.sum()).backward()
+    assert {name for name, _ in scene.named_children()} == {"scaffold", "appearance"} | networks
+    early, late = (composition.gaussians for composition in scene.compose_together([(EYE, 0.1), (EYE, 0.8)]))
+    for name in GEOMETRY + APPEARANCE:
+        assert torch.equal(getattr(early, name), getattr(late, name)) is (name in constant), name
+    random = torch.Generator().manual_seed(0)
+    loss = torch.zeros(())
+    for values in (getattr(late, name) for name in GEOMETRY + APPEARANCE):
+        loss = loss + (values * torch.randn(values.shape, generator=random)).sum()
+    loss.backward()
     for name, parameter in scene.named_parameters():
-        if parameter.grad is not None:
-            assert bool(torch.isfinite(parameter.grad).all()), name
+        assert parameter.grad is not None, name
+        assert 0 < float(parameter.grad.norm()) < math.inf, name
 
 
-def test_opacity_ignores_the_view_unless_asked() -> None:
+def test_without_the_canonical_branch_children_have_no_rotation_and_the_initial_scale() -> None:
+    scene = tiny_scene(canonical=False, temporal=False)
+    composition = scene.compose(EYE, 0.4)
+    gaussians, owners = composition.gaussians, composition.children // scene.scaffold.slots
+    assert torch.equal(gaussians.quats, torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(len(owners), 4))
+    expected = scene.scaffold.log_scales[owners] + math.log(INITIAL_SCALE)
+    torch.testing.assert_close(gaussians.log_scales, expected, rtol=0, atol=1e-6)
+
+
+def test_opacity_depends_on_the_view_only_with_opacity_view() -> None:
     for view, same in ((False, True), (True, False)):
         scene = tiny_scene(opacity_view=view)
         here = scene.compose(EYE, 0.4).opacities
@@ -153,14 +183,14 @@ def test_camera_on_an_anchor_gives_finite_colours() -> None:
     assert bool(torch.isfinite(gaussians.colors).all())
 
 
-def test_temporal_pair_reuses_the_same_network() -> None:
+def test_deform_gives_the_deformation_of_the_composition() -> None:
     scene = tiny_scene()
     composition = scene.compose(EYE, 0.4)
     again = scene.deform(composition.children, composition.canonical_means, 0.4)
     assert torch.equal(again.position, composition.deformation.position)
 
 
-def test_projected_clip_passes_only_gradients_that_point_back_inside() -> None:
+def test_projected_clip_blocks_only_gradients_that_point_outwards() -> None:
     x = torch.tensor([-1.0, -1.0, 0.5, 2.0, 2.0], requires_grad=True)
     clip(x, 0.0, 1.0, projected=True).backward(torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0]))
     assert torch.equal(x.grad, torch.tensor([0.0, -1.0, 1.0, 1.0, 0.0]))
@@ -170,14 +200,16 @@ def test_projected_clip_passes_only_gradients_that_point_back_inside() -> None:
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 2.0**-24)])
-def test_encoding_by_the_kernel_equals_its_oracle_to_the_last_octave(dtype: torch.dtype, tolerance: float) -> None:
+def test_encoding_by_the_kernel_equals_its_oracle_up_to_the_highest_octave(
+    dtype: torch.dtype, tolerance: float
+) -> None:
     x = (torch.rand(2_500, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 4 - 2).to(dtype)
     expected = plain_frequency_encoding(x.double(), 12)
     assert (frequency_encoding(x, 12).double() - expected).abs().max() <= tolerance
     kernel.set_threads(1)
-    alone = frequency_encoding(x, 12)
+    single_threaded = frequency_encoding(x, 12)
     kernel.set_threads(None)
-    assert torch.equal(alone, frequency_encoding(x, 12))
+    assert torch.equal(single_threaded, frequency_encoding(x, 12))
 
 
 def test_encoding_is_differentiable_where_positions_are_not_constants() -> None:
@@ -188,21 +220,21 @@ def test_encoding_is_differentiable_where_positions_are_not_constants() -> None:
 
 
 @pytest.mark.parametrize("view", [True, False])
-def test_no_direction_gives_more_than_the_highest_opacity(view: bool) -> None:
+def test_no_direction_gives_more_than_the_bound_of_opacity(view: bool) -> None:
     appearance, features = (scene := tiny_scene(opacity_view=view)).appearance, scene.scaffold.features
     highest = appearance.highest_opacity_logits(features)
     directions = functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    found = torch.stack([appearance.opacity_logits(features, d.expand(len(features), 3)) for d in directions])
-    assert (found <= highest + 1e-6).all()
-    if view:  # a bound that is never near would be of no use
-        assert (highest - found.amax(0)).max() < 0.5
+    logits = torch.stack([appearance.opacity_logits(features, d.expand(len(features), 3)) for d in directions])
+    assert (logits <= highest + 1e-6).all()
+    if view:  # the bound is tight enough to be useful
+        assert (highest - logits.amax(0)).max() < 0.5
     else:
-        assert torch.allclose(found.amax(0), highest, atol=1e-6)
+        assert torch.allclose(logits.amax(0), highest, atol=1e-6)
 
 
-def test_direction_encoding_begins_with_the_direction_and_takes_each_harmonic_once() -> None:
-    # The rule is exact for products of two harmonics: Gauss nodes along the axis, even steps around it.
-    heights, shares = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(4))
+def test_direction_encoding_begins_with_the_direction_and_is_orthogonal() -> None:
+    # This quadrature is exact for products of two harmonics: Gauss nodes along the axis, equal angles around it.
+    heights, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(4))
     angles = torch.arange(8, dtype=torch.float64) * math.pi / 4
     radii = (1 - heights * heights).sqrt().unsqueeze(1)
     sphere = torch.stack([radii * angles.cos(), radii * angles.sin(), heights.unsqueeze(1).expand(4, 8)], dim=-1)
@@ -210,18 +242,18 @@ def test_direction_encoding_begins_with_the_direction_and_takes_each_harmonic_on
         encoded = direction_encoding(sphere, degree)
         assert encoded.shape[-1] == direction_width(degree)
         assert torch.equal(encoded[..., :3], sphere)
-        weighed = encoded * (shares / 16).view(4, 1, 1)
-        products = weighed.flatten(0, 1).T @ encoded.flatten(0, 1)
+        weighted = encoded * (weights / 16).view(4, 1, 1)
+        products = weighted.flatten(0, 1).T @ encoded.flatten(0, 1)
         assert torch.allclose(products, torch.eye(direction_width(degree), dtype=torch.float64) / 3, atol=1e-15)
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf])
-def test_encoding_of_a_number_that_is_none_is_none(x: float) -> None:
+def test_encoding_of_a_non_finite_number_is_nan(x: float) -> None:
     assert frequency_encoding(torch.full((1, 3), x), 2)[:, 3:].isnan().all()
 
 
-def test_networks_begin_alike_whichever_others_there_are() -> None:
-    full, without = tiny_scene(active=False), tiny_scene(active=False, residual=False, canonical=False)
+def test_initial_weights_do_not_depend_on_which_other_networks_exist() -> None:
+    full, without = tiny_scene(trained=False), tiny_scene(trained=False, residual=False, canonical=False)
     assert len(without.state_dict()) < len(full.state_dict())
     for name, values in without.state_dict().items():
         assert torch.equal(values, full.state_dict()[name]), name

@@ -1,17 +1,23 @@
-"""ColmapCamera: intrinsics as COLMAP writes them, the language in which all readers speak of lenses.
+"""ColmapCamera: intrinsics in COLMAP's camera models, which all readers convert to undistorted cameras.
 
-Knows nothing of poses, of COLMAP's files or of image files.
+The checks that are common to all formats are here, too.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from graings.camera.camera import Camera
+from graings.capture.image_file import ImageFile
 from graings.capture.lens import Lens
 from graings.errors import CaptureError
 
-# By the id in cameras.bin: name, number of parameters, number of focal lengths that lead them (cx, cy follow).
+# By the id in cameras.bin: name, number of parameters, number of focal lengths, which come first (cx, cy follow).
 CAMERA_MODELS: Final[dict[int, tuple[str, int, int]]] = {
     0: ("SIMPLE_PINHOLE", 3, 1),
     1: ("PINHOLE", 4, 2),
@@ -33,10 +39,13 @@ CAMERA_MODELS: Final[dict[int, tuple[str, int, int]]] = {
 }
 MODELS: Final = {name: (count, focals) for name, count, focals in CAMERA_MODELS.values()}
 
+# Downscaling rounds the size of an image to whole pixels: aspect ratios may differ by this many px of the shorter side.
+ROUNDING_TOLERANCE: Final = 1.0
+
 
 @dataclass(frozen=True, slots=True)
 class ColmapCamera:
-    """`params` are focal lengths, principal point, then distortion."""
+    """A distorted camera; `params` are focal lengths, principal point and distortion, in px where lengths."""
 
     model: str
     width: int
@@ -45,18 +54,18 @@ class ColmapCamera:
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy without the distortion."""
+        """fx, fy, cx, cy in px, without the distortion."""
         focals = MODELS[self.model][1]
         cx, cy = self.params[focals : focals + 2]
         return self.params[0], self.params[focals - 1], cx, cy
 
     @property
     def distortion(self) -> tuple[float, ...]:
-        """The parameters behind the principal point."""
+        """The parameters after the principal point."""
         return self.params[MODELS[self.model][1] + 2 :]
 
     def scaled(self, width: int, height: int) -> ColmapCamera:
-        """The same camera for pictures of another size and the same shape."""
+        """The same camera for images of another size with the same aspect ratio."""
         sx, sy = width / self.width, height / self.height
         focals = MODELS[self.model][1]
         factors = ([sx] if focals == 1 else [sx, sy]) + [sx, sy] + [1.0] * len(self.distortion)
@@ -64,9 +73,9 @@ class ColmapCamera:
         return ColmapCamera(self.model, width, height, params)
 
     def lens(self, file: str, field: str) -> Lens | None:
-        """How its photographs are undistorted; None where it is a pinhole already.
+        """The lens that undistorts its images; None where it is a pinhole already.
 
-        Raises `CaptureError` naming `file` and `field` where that cannot be, or needs pycolmap.
+        Raises `CaptureError` naming `file` and `field` where this is impossible or requires pycolmap.
         """
         try:
             return Lens.of(self.model, self.params, (self.width, self.height), self.distortion)
@@ -84,3 +93,41 @@ class ColmapCamera:
                 field=field,
                 remedy="Undistort with `colmap image_undistorter` and give its output.",
             ) from error
+
+
+class UndistortedCameras:
+    """Undistorted cameras of the images in `file`; images with the same distorted camera share its lens."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self._lenses: dict[ColmapCamera, Lens | None] = {}
+
+    def of(
+        self, distorted: ColmapCamera, world_to_camera: NDArray[np.float64], field: str
+    ) -> tuple[Camera, Lens | None]:
+        """The camera of an undistorted image with the pose `world_to_camera` [4, 4], and the lens that undistorts it.
+
+        Raises `CaptureError` naming the file and `field`.
+        """
+        if distorted not in self._lenses:
+            self._lenses[distorted] = distorted.lens(self.file, field)
+        lens = self._lenses[distorted]
+        pinhole, size = distorted.pinhole, (distorted.width, distorted.height)
+        if lens is not None:
+            pinhole, size = lens.pinhole, lens.pinhole_size
+        try:
+            return Camera(world_to_camera, *pinhole, *size), lens
+        except ValueError as error:  # for example a focal length that overflows
+            raise CaptureError(str(error), file=self.file, field=field, remedy="Correct the camera there.") from error
+
+
+def image_scale(image: ImageFile, width: float, height: float) -> tuple[float, float] | None:
+    """Size of `image` over the size in px for which its intrinsics are given; None where the aspect ratios differ."""
+    sx, sy = image.width / width, image.height / height
+    return None if abs(sx - sy) * min(width, height) > ROUNDING_TOLERANCE else (sx, sy)
+
+
+def undistortion_notes(lenses: Iterable[Lens | None]) -> list[str]:
+    """A note that names the camera models that are undistorted; none if there are none."""
+    models = sorted({lens.model for lens in lenses if lens is not None})
+    return [f"images are undistorted when decoded ({', '.join(models)})"] if models else []

@@ -1,7 +1,7 @@
 """ColmapModel: the three files of a sparse COLMAP model, binary or text, as plain records.
 
-Read here, not through pycolmap: its readers never return from a truncated images.bin and take a truncated cameras.bin
-without a word. Knows nothing of image files, splits or undistortion.
+They are not read through pycolmap, because its readers do not return from a truncated images.bin and accept a truncated
+cameras.bin without an error.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from graings.capture.folder import CaptureFolder
 from graings.capture.readers.colmap_camera import CAMERA_MODELS, MODELS, ColmapCamera
 from graings.errors import CaptureError
+
+MIN_QUATERNION_NORM = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,10 +41,10 @@ class ColmapModel:
     colors: NDArray[np.float32]
 
 
-def read_model(folder: CaptureFolder, where: str) -> ColmapModel:
-    """The model in the sub-folder `where`. Raises `CaptureError` for anything missing, truncated or impossible."""
-    suffix = ".bin" if folder.has(f"{where}/cameras.bin") else ".txt"
-    names = [f"{where}/{part}{suffix}" for part in ("cameras", "images", "points3D")]
+def read_model(folder: CaptureFolder, model_folder: str) -> ColmapModel:
+    """The model in `model_folder`. Raises `CaptureError` for missing or truncated files and impossible values."""
+    suffix = ".bin" if folder.has(f"{model_folder}/cameras.bin") else ".txt"
+    names = [f"{model_folder}/{part}{suffix}" for part in ("cameras", "images", "points3D")]
     contents = [folder.read(name) for name in names]
     if suffix == ".bin":
         files = [_Binary(name, data) for name, data in zip(names, contents, strict=True)]
@@ -55,33 +57,33 @@ def read_model(folder: CaptureFolder, where: str) -> ColmapModel:
 
 
 class _Binary:
-    """A little-endian file read from front to back, never past its end."""
+    """A little-endian file that is read sequentially; reading past its end raises `CaptureError`."""
 
     def __init__(self, name: str, data: bytes) -> None:
-        self.name, self.data, self.at = name, data, 0
+        self.name, self.data, self.position = name, data, 0
 
     def take(self, layout: str) -> tuple[float, ...]:
-        at = self.skip(struct.calcsize(layout))
-        return struct.unpack_from(layout, self.data, at)
+        start = self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self.data, start)
 
     def skip(self, size: int) -> int:
-        at = self.at
-        if at + size > len(self.data):
+        start = self.position
+        if start + size > len(self.data):
             raise CaptureError("is truncated", file=self.name, remedy="Copy the model again.")
-        self.at += size
-        return at
+        self.position += size
+        return start
 
     def text(self) -> str:
-        end = self.data.find(b"\0", self.at)
-        at = self.skip((end if end >= 0 else len(self.data)) + 1 - self.at)
-        return self.data[at:end].decode("utf-8", errors="surrogateescape")
+        end = self.data.find(b"\0", self.position)
+        start = self.skip((end if end >= 0 else len(self.data)) + 1 - self.position)
+        return self.data[start:end].decode("utf-8", errors="surrogateescape")
 
     def count(self) -> range:
         return range(int(self.take("<Q")[0]))
 
     def finish(self) -> None:
-        if self.at != len(self.data):
-            self.fail(f"{len(self.data) - self.at} bytes too many")
+        if self.position != len(self.data):
+            self.fail(f"{len(self.data) - self.position} bytes too many")
 
     def fail(self, problem: str) -> NoReturn:
         raise CaptureError(problem, file=self.name, remedy="Export the model again.")
@@ -102,16 +104,16 @@ class _Text:
     def fail(self, number: int, problem: str) -> NoReturn:
         raise CaptureError(problem, file=self.name, field=f"line {number + 1}", remedy="Export the model again.")
 
-    def finish(self, found: int) -> None:
-        # COLMAP writes the count in a comment: the only sign of a file cut between two lines.
+    def finish(self, entries: int) -> None:
+        # COLMAP writes the count in a comment. Only it shows that a file was truncated between two lines.
         for line in self.lines:
             if line.startswith("# Number of "):
                 stated = line.partition(":")[2].partition(",")[0].strip()
-                if stated.isdigit() and int(stated) != found:
+                if stated.isdigit() and int(stated) != entries:
                     raise CaptureError(
-                        f"announces {stated} entries and holds {found}",
+                        f"declares {stated} entries and contains {entries}",
                         file=self.name,
-                        remedy="Copy the model again, or correct the comment where entries were removed on purpose.",
+                        remedy="Copy the model again, or correct the comment if entries were removed on purpose.",
                     )
 
 
@@ -225,7 +227,7 @@ def _pose(file: str, name: str, values: tuple[float, ...]) -> NDArray[np.float64
         raise CaptureError("the pose is not finite", file=file, field=name, remedy="Register the image again.")
     quaternion = np.array(values[:4])
     length = float(np.linalg.norm(quaternion))
-    if length < 1e-6:
+    if length < MIN_QUATERNION_NORM:
         raise CaptureError("the rotation is zero", file=file, field=name, remedy="Register the image again.")
     w, x, y, z = quaternion / length
     pose = np.eye(4)

@@ -1,7 +1,4 @@
-"""JSON documents of a capture: parsed and checked by a pydantic type, failures said in the capture's terms.
-
-Knows nothing of what the documents mean.
-"""
+"""JSON documents of a capture: parsed and validated by a pydantic type, with failures as `CaptureError`."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ T = TypeVar("T")
 
 
 def parse_json(kind: TypeAdapter[T], data: bytes, file: str) -> T:
-    """`data` as `kind`. Raises `CaptureError` with the first field that does not fit."""
+    """`data` as `kind`. Raises `CaptureError` with the first invalid field."""
     try:
         return kind.validate_json(data.removeprefix(b"\xef\xbb\xbf"))
     except ValidationError as error:

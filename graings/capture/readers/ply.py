@@ -1,7 +1,6 @@
-"""read_ply: the vertices of a PLY file and their colours, whatever else it holds.
+"""read_ply: the vertices of a PLY file and their colours; everything else in the file is ignored.
 
-Knows nothing of what the points are for. Read here rather than by a library because a cut file has to be told from a
-whole one, and nothing but `vertex` is wanted.
+It is not read by a library, because a truncated file must be distinguished from a complete one.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _TYPES: Final = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_PLACE: Final = ("x", "y", "z")
+_POSITION: Final = ("x", "y", "z")
 _COLOR: Final = ("red", "green", "blue")
 _HEADER_END: Final = b"end_header"
 _GREY: Final = 0.5
@@ -33,21 +32,21 @@ _GREY: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    order: str  # numpy's sign of the byte order; empty: text
+    order: str  # byte order in numpy's notation; empty: text
     count: int
-    properties: tuple[tuple[str, str], ...]  # name and numpy type, without order
-    start: int  # where the vertices begin
+    properties: tuple[tuple[str, str], ...]  # name and numpy type without byte order
+    start: int  # offset of the vertices in bytes
 
 
 def read_ply(name: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Positions [M, 3] and colours [M, 3] in [0, 1], grey where the file has none.
 
-    Whole numbers are colours out of the largest of their type, others are taken as they are. Raises `CaptureError`
+    Integer colours are divided by the maximum of their type, floating-point ones are not scaled. Raises `CaptureError`
     naming the file `name`.
     """
     header = _header(name, data)
     table = _text(name, data, header) if not header.order else _binary(name, data, header)
-    positions = np.stack([table[key].astype(np.float64) for key in _PLACE], axis=1)
+    positions = np.stack([table[key].astype(np.float64) for key in _POSITION], axis=1)
     if not set(_COLOR) <= set(table.dtype.names or ()):
         return positions, np.full((header.count, 3), _GREY, dtype=np.float32)
     channels = []
@@ -64,7 +63,7 @@ def read_ply(name: str, data: bytes) -> tuple[NDArray[np.float64], NDArray[np.fl
 def _header(name: str, data: bytes) -> _Header:
     end = data.find(_HEADER_END)
     if not data.startswith(b"ply") or end < 0:
-        _fail(name, "is no PLY file, or cut within its header")
+        _fail(name, "is no PLY file, or truncated in its header")
     line_end = data.find(b"\n", end)
     if line_end < 0:
         line_end = len(data) - 1
@@ -88,10 +87,10 @@ def _header(name: str, data: bytes) -> _Header:
         else:
             _fail(name, f"has the line {line.strip()!r} in its header, which is not read")
     if order is None:
-        _fail(name, "does not say its format")
+        _fail(name, "does not declare its format")
     if not elements or elements[0][0] != "vertex":
         _fail(name, "does not begin with vertices")
-    if not set(_PLACE) <= set(dict(properties)):
+    if not set(_POSITION) <= set(dict(properties)):
         _fail(name, "has vertices without x, y and z")
     return _Header(order, elements[0][1], tuple(properties), line_end + 1)
 
@@ -99,7 +98,7 @@ def _header(name: str, data: bytes) -> _Header:
 def _binary(name: str, data: bytes, header: _Header) -> NDArray[np.void]:
     kind = np.dtype([(key, header.order + base) for key, base in header.properties])
     if header.start + header.count * kind.itemsize > len(data):
-        _fail(name, f"is cut: it announces {header.count} vertices and has not as many")
+        _fail(name, f"is truncated: it declares {header.count} vertices and contains fewer")
     return np.frombuffer(data, dtype=kind, count=header.count, offset=header.start)
 
 
@@ -107,20 +106,20 @@ def _text(name: str, data: bytes, header: _Header) -> NDArray[np.void]:
     lines = data[header.start :].decode("ascii", errors="replace").splitlines()
     rows = [line.split() for line in lines if line.strip()][: header.count]
     if len(rows) < header.count:
-        _fail(name, f"is cut: it announces {header.count} vertices and has {len(rows)}")
+        _fail(name, f"is truncated: it declares {header.count} vertices and contains {len(rows)}")
     table = np.empty(header.count, dtype=np.dtype(list(header.properties)))
     for number, row in enumerate(rows):
         if len(row) != len(header.properties):
-            _fail(name, f"has {len(row)} numbers for {len(header.properties)} in vertex {number}")
+            _fail(name, f"has {len(row)} numbers instead of {len(header.properties)} in vertex {number}")
         try:
             table[number] = tuple(
                 float(word) if base.startswith("f") else int(word)
                 for word, (_, base) in zip(row, header.properties, strict=True)
             )
         except (ValueError, OverflowError):
-            _fail(name, f"has something else than its numbers in vertex {number}")
+            _fail(name, f"has a value that does not fit its type in vertex {number}")
     return table
 
 
 def _fail(name: str, problem: str) -> NoReturn:
-    raise CaptureError(problem, file=name, remedy="Export the points again, or take ply_file_path out.")
+    raise CaptureError(problem, file=name, remedy="Export the points again, or remove ply_file_path.")

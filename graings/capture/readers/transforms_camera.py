@@ -1,7 +1,4 @@
-"""TransformsCamera: from the intrinsics of a transforms file to the camera of an undistorted picture.
-
-Knows nothing of poses beyond handing them on, of times or of splits.
-"""
+"""TransformsCamera: cameras of undistorted images from the intrinsics of a transforms file."""
 
 from __future__ import annotations
 
@@ -15,22 +12,22 @@ from pydantic import BaseModel, ConfigDict, Field
 from graings.camera.camera import Camera
 from graings.capture.image_file import ImageFile
 from graings.capture.lens import Lens
-from graings.capture.readers.colmap_camera import ColmapCamera
+from graings.capture.readers.colmap_camera import ColmapCamera, UndistortedCameras, image_scale
 from graings.errors import CaptureError
 
 Angle = Annotated[float, Field(gt=0, lt=math.pi)]
 Length = Annotated[float, Field(gt=0)]
 Coefficient = Literal["k1", "k2", "k3", "k4", "p1", "p2"]
 
-# nerfstudio's names; the distortion is what the coefficients say, so that the perspective ones are all alike.
+# Camera models of nerfstudio. The coefficients define the distortion, so all perspective models are equivalent.
 PERSPECTIVE: Final = frozenset(("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"))
 FISHEYE: Final = frozenset(("OPENCV_FISHEYE", "FISHEYE"))
 
 
 class Intrinsics(BaseModel):
-    """Keys that may stand at the top of the file or in a frame, where they win."""
+    """Intrinsics at the top of the file or in a frame; those of the frame take precedence."""
 
-    # Other programs add keys of their own; those that bend the picture are named here to be understood or refused.
+    # Other programs add keys of their own. All keys of distortion are declared here, so that none is ignored silently.
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
     camera_model: str | None = None
@@ -56,50 +53,39 @@ class Intrinsics(BaseModel):
 
 
 class TransformsCamera:
-    """Cameras of one file, whose `top` holds what frames do not say themselves."""
+    """Cameras of one file, whose intrinsics at the `top` apply to frames without their own."""
 
     def __init__(self, top: Intrinsics, file: str) -> None:
         self.top, self.file = top, file
-        self._lenses: dict[ColmapCamera, Lens | None] = {}  # many frames share one
+        self._undistorted = UndistortedCameras(file)
 
     def of(
-        self, frame: Intrinsics, pose: NDArray[np.float64], image: ImageFile, where: str
+        self, frame: Intrinsics, world_to_camera: NDArray[np.float64], image: ImageFile, field: str
     ) -> tuple[Camera, Lens | None]:
-        """The camera at `pose` [4, 4] (world to camera) of `image` once undistorted, and the lens that does it.
+        """Camera of the undistorted `image` with the pose `world_to_camera` [4, 4], and the lens that undistorts it.
 
-        Raises `CaptureError` naming the file and `where`.
+        Raises `CaptureError` naming the file and `field`.
         """
-        bent = self._colmap(frame, image, where)
-        if bent not in self._lenses:
-            self._lenses[bent] = bent.lens(self.file, where)
-        lens = self._lenses[bent]
-        if lens is None:
-            pinhole, size = bent.pinhole, (bent.width, bent.height)
-        else:
-            pinhole, size = lens.pinhole, lens.pinhole_size
-        try:
-            return Camera(pose, *pinhole, *size), lens
-        except ValueError as error:  # such as a product beyond all numbers
-            raise CaptureError(str(error), file=self.file, field=where, remedy="Mend the camera there.") from error
+        return self._undistorted.of(self._distorted(frame, image, field), world_to_camera, field)
 
-    def _colmap(self, frame: Intrinsics, image: ImageFile, where: str) -> ColmapCamera:
-        """The camera of `image` as it is, in COLMAP's terms."""
-        pinhole = self._pinhole(frame, image, where)
+    def _distorted(self, frame: Intrinsics, image: ImageFile, field: str) -> ColmapCamera:
+        """The camera of the distorted `image` as one of COLMAP's models."""
+        pinhole = self._pinhole(frame, image, field)
         k1, k2, k3, k4, p1, p2 = (self._coefficient(frame, key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
         name = frame.camera_model or self.top.camera_model
         fisheye = name in FISHEYE or bool(frame.is_fisheye or (frame.is_fisheye is None and self.top.is_fisheye))
         problem = None
         if name is not None and name not in PERSPECTIVE | FISHEYE:
-            problem = f"the camera model {name} is not read"
+            problem = f"the camera model {name} is not supported"
         elif fisheye and (p1 or p2):
-            problem = "a fisheye lens with tangential distortion (p1, p2) is not read"
+            problem = "a fisheye lens with tangential distortion (p1, p2) is not supported"
         elif not fisheye and k4:
-            problem = "a fourth radial coefficient (k4) is not read"
+            problem = "a fourth radial coefficient (k4) is not supported"
         if problem is not None:
             raise CaptureError(
                 problem,
                 file=self.file,
-                field=where,
+                field=field,
                 remedy="Undistort the images first, or give the COLMAP folder instead.",
             )
         distortion: tuple[float, ...]
@@ -115,22 +101,22 @@ class TransformsCamera:
         own, shared = getattr(frame, key), getattr(self.top, key)
         return float(own if own is not None else shared if shared is not None else 0.0)
 
-    def _pinhole(self, frame: Intrinsics, image: ImageFile, where: str) -> tuple[float, float, float, float]:
+    def _pinhole(self, frame: Intrinsics, image: ImageFile, field: str) -> tuple[float, float, float, float]:
         """fx, fy, cx, cy in px of `image`."""
         focal = frame if frame.has_focal() else self.top
         if not focal.has_focal():
             raise CaptureError(
                 "no focal length: neither camera_angle_x nor fl_x is given",
                 file=self.file,
-                field=where,
+                field=field,
                 remedy="Add one of them to the frame or to the top of the file.",
             )
-        sx, sy = self._scale(frame, image, where)
+        sx, sy = self._scale(frame, image, field)
         if focal.fl_x is not None:
             fx = focal.fl_x * sx
             fy = (focal.fl_y if focal.fl_y is not None else focal.fl_x) * sy
         else:
-            assert focal.camera_angle_x is not None  # has_focal
+            assert focal.camera_angle_x is not None  # as has_focal is true
             fx = 0.5 * image.width / math.tan(0.5 * focal.camera_angle_x)
             angle_y = focal.camera_angle_y
             fy = fx if angle_y is None else 0.5 * image.height / math.tan(0.5 * angle_y)
@@ -138,21 +124,19 @@ class TransformsCamera:
         cy = frame.cy if frame.cy is not None else self.top.cy
         return fx, fy, 0.5 * image.width if cx is None else cx * sx, 0.5 * image.height if cy is None else cy * sy
 
-    def _scale(self, frame: Intrinsics, image: ImageFile, where: str) -> tuple[float, float]:
-        """Size of the file over the size its intrinsics are given for."""
+    def _scale(self, frame: Intrinsics, image: ImageFile, field: str) -> tuple[float, float]:
+        """Size of `image` over the size for which its intrinsics are given."""
         width = frame.w if frame.w is not None else self.top.w
         height = frame.h if frame.h is not None else self.top.h
-        sx = 1.0 if width is None else image.width / width
-        sy = 1.0 if height is None else image.height / height
-        # A file scaled down may have lost up to a pixel of its shorter side to rounding.
-        if abs(sx - sy) * min(width or image.width, height or image.height) > 1.0:
+        scale = image_scale(image, width or image.width, height or image.height)
+        if scale is None:
             raise CaptureError(
                 f"the intrinsics are for {width:g}x{height:g} px, the image {image.name} has "
                 f"{image.width}x{image.height}"
                 if width is not None and height is not None
                 else f"one of w and h is missing and the other differs from the image {image.name}",
                 file=self.file,
-                field=f"{where}.w, h",
-                remedy="Give w and h of the images as they are, or images of the same shape.",
+                field=f"{field}.w, h",
+                remedy="Give w and h of the image files, or images of the same aspect ratio.",
             )
-        return sx, sy
+        return scale
