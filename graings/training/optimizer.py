@@ -20,7 +20,7 @@ from graings.training.guard import Gradient
 from graings.training.muon import Muon
 
 # Rates are those of one view a step; with more they rise by this power of their number. Steps of four views at 1.5
-# times the rates end where twice as many steps of two views do (docs/experiments.md).
+# times the rates end where twice as many steps of two views do (docs/experiments/).
 BATCH_POWER = 1 / 3
 
 ADAM_EPSILON = 1e-15  # gradients of one Gaussian are tiny; the usual 1e-8 would damp them (3DGS)
