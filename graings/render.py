@@ -46,7 +46,7 @@ def picture(
     """As `draw`, without gradients, for any size and distance: pixels coarser than training's are means of finer ones.
 
     A rasterizer looks at the middles of pixels only, and what the model knows lies between them: drawn at once, a
-    picture of half the size is 2 to 7 dB worse, and one of a quarter 8 to 17 (docs/experiments.md). The networks take
+    picture of half the size is 2 to 7 dB worse, and one of a quarter 8 to 17 (docs/experiments/). The networks take
     most of a picture's time, so that the finer pixels hardly cost any.
     """
     parts = supersampling(composition, camera)
@@ -106,7 +106,7 @@ def low_pass(composition: Composition, camera: Camera) -> float:
 
     The composition's own where the camera looks as finely as training's reference. With as much in the pixels of every
     camera, a picture of twice the size shows the gaps that training had closed, and far views of training widen what
-    near ones want narrow: 1 to 8 dB (docs/experiments.md).
+    near ones want narrow: 1 to 8 dB (docs/experiments/).
     """
     relative_rate = composition.sampling.relative_rate(camera)
     return composition.blur * relative_rate * relative_rate  # a power would raise where this is infinite
