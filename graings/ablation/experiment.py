@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from graings.ablation.plot import differences_svg
+from graings.ablation.plot import differences_figure
 from graings.ablation.rows import ROWS, Row, chosen_rows, combined, nothing_to_compare, row_config
 from graings.ablation.table import SCHEMA, document, markdown
 from graings.capture.capture import Capture
 from graings.capture.load import load_capture
 from graings.config import TrainConfig, make_config
 from graings.errors import CaptureError, CheckpointError, ConfigError
-from graings.report.picture import missing_reason, png
+from graings.report.figure_files import png, svg
 from graings.report.report import read_metrics, write_bytes, write_metrics, write_text
 from graings.training.run import TrainingRun
 
@@ -110,16 +110,15 @@ class Ablation:
             self.write()
 
     def write(self) -> dict[str, Any]:
-        """Write ablation.json, .md, .svg and, with matplotlib, .png from all finished runs; returns the first."""
+        """Write ablation.json, .md, .svg and .png from all finished runs; returns the first."""
         self.folder.mkdir(parents=True, exist_ok=True)
         rows = [(row, {seed: self._of(row, seed) for seed in self._shown_seeds}) for row in self._shown_rows]
         table = document(self._facts(), rows)
         write_metrics(self.folder / TABLE, table)
         write_text(self.folder / "ablation.md", markdown(table))
-        drawing = differences_svg(table)
-        write_text(self.folder / "ablation.svg", drawing)
-        if missing_reason() is None:
-            write_bytes(self.folder / "ablation.png", png(drawing))
+        figure = differences_figure(table)
+        write_text(self.folder / "ablation.svg", svg(figure))
+        write_bytes(self.folder / "ablation.png", png(figure))
         return table
 
     def _facts(self) -> dict[str, Any]:

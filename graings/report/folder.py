@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from graings.errors import CheckpointError
-from graings.report.picture import missing_reason, png
-from graings.report.plots import training_svg
-from graings.report.render_plot import render_svg
+from graings.report.figure_files import png, svg
+from graings.report.render_plot import render_figure
 from graings.report.render_precision import BUDGET_S, render_part
 from graings.report.report import read_metrics, write_bytes, write_metrics, write_text
 from graings.report.tables import tables
+from graings.report.training_plot import training_figure
 from graings.report.work_precision import document, read_run, run_names, training_part
 from graings.storage.compact import open_model
 
@@ -42,8 +42,8 @@ def report_runs(runs: Sequence[Path], folder: Path, *, render: bool = True, budg
     """Write the report of `runs`, folders of runs or their `metrics.json`, to `folder`, pictures as SVG and PNG.
 
     With `render` the model of every run is drawn and timed for about `budget_s` seconds, with the threads of this
-    process. A run without a model, and PNG without matplotlib, are left out with a note. Raises `CheckpointError`
-    naming a run whose metrics cannot be read, `ValueError` when one is given twice.
+    process. A run without a model is left out with a note. Raises `CheckpointError` naming a run whose metrics cannot
+    be read, `ValueError` when one is given twice.
     """
     names = run_names(runs)
     training = [_training(name, path) for name, path in zip(names, runs, strict=True)]
@@ -76,22 +76,19 @@ def _folder(path: Path) -> Path:
 
 def _write(folder: Path, report: Mapping[str, Any], *, pictures: bool) -> Written:
     folder.mkdir(parents=True, exist_ok=True)
-    drawings = {"training": training_svg(report["training"])}
+    figures = {"training": training_figure(report["training"])}
     if report["render"]:
-        drawings["render"] = render_svg(report["render"])
-    texts = tables(report) | {f"{name}.svg": drawing for name, drawing in drawings.items()}
+        figures["render"] = render_figure(report["render"])
+    texts = tables(report) | {f"{name}.svg": svg(figure) for name, figure in figures.items()}
     # What only an earlier report had would contradict this one.
     for stale in {"render.csv", "render.svg", "render.png", "training.png"} - texts.keys():
         (folder / stale).unlink(missing_ok=True)
     write_metrics(folder / DOCUMENT, report)
     for name, text in texts.items():
         write_text(folder / name, text)
-    files, notes = [DOCUMENT, *texts], list(report["omissions"])
-    reason = missing_reason() if pictures else None
-    if reason is not None:
-        notes.append(f"PNG left out: {reason}")
-    elif pictures:
-        for name, drawing in drawings.items():
-            write_bytes(folder / f"{name}.png", png(drawing))
+    files = [DOCUMENT, *texts]
+    if pictures:
+        for name, figure in figures.items():
+            write_bytes(folder / f"{name}.png", png(figure))
             files.append(f"{name}.png")
-    return Written(folder, tuple(files), report, tuple(notes))
+    return Written(folder, tuple(files), report, tuple(report["omissions"]))

@@ -18,9 +18,11 @@ from graings.config import TrainConfig
 from graings.evaluation.evaluate import frames_per_second, subset
 from graings.evaluation.metrics import SplitMetrics
 from graings.plan.plan import Plan
+from graings.report.curve import curve_figure
+from graings.report.figure_files import svg
 from graings.report.folder import report_training
 from graings.report.machine import machine_facts, version_facts
-from graings.report.report import METRICS_SCHEMA, config_hash, curve_svg, write_metrics, write_text
+from graings.report.report import METRICS_SCHEMA, config_hash, write_metrics, write_text
 from graings.report.work_precision import run_names
 from graings.scene.scene import Scene
 from graings.storage.model import scene_bytes
@@ -185,7 +187,7 @@ class TrainingLog:
             "hashes": {"config": config_hash(self.config), "capture": self.capture.content_hash},
         }
         write_metrics(self.folder / "metrics.json", document)
-        write_text(self.folder / "curve.svg", curve_svg(self.curve))
+        write_text(self.folder / "curve.svg", svg(curve_figure(self.curve)))
         name = run_names([self.folder])[0]
         facts = {"config": self.config.model_dump(mode="json")}
         report_training(name, document, facts, self.folder / "report")

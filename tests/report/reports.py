@@ -1,15 +1,12 @@
-"""Hand-made metrics of runs that nobody trained, and the words of a drawing."""
+"""Hand-made metrics of runs, without training."""
 
 from __future__ import annotations
 
 import json
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
 from graings.report.work_precision import training_part
-
-SVG = "{http://www.w3.org/2000/svg}"
 
 
 def point(train_s: float, psnr: float | None, *, iteration: int = 100, gaussians: int = 1000) -> dict[str, Any]:
@@ -46,14 +43,3 @@ def write_run(folder: Path, document: dict[str, Any]) -> Path:
     folder.mkdir(parents=True)
     (folder / "metrics.json").write_text(json.dumps(document))
     return folder
-
-
-def elements(svg: str, tag: str, kind: str = "") -> list[ElementTree.Element]:
-    """Elements of a drawing whose classes contain `kind`."""
-    found = ElementTree.fromstring(svg).iter(f"{SVG}{tag}")
-    return [element for element in found if not kind or kind in element.attrib.get("class", "").split()]
-
-
-def words(svg: str) -> list[str]:
-    """All texts of a drawing."""
-    return [element.text or "" for element in elements(svg, "text")]
