@@ -18,4 +18,7 @@ def error(value: float) -> str:
 
 def count(number: float) -> str:
     """A number of things for a reader."""
-    return f"{number:.3g}" if number < 1000 else f"{number / 1000:.3g}k"
+    for size, unit in ((1e6, "M"), (1e3, "k")):
+        if number >= size:
+            return f"{number / size:.3g}{unit}"
+    return f"{number:.3g}"

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from graings.report.axes import line_style, log_ticks, shortened
 from graings.report.curve import curve_figure
 from graings.report.figure_files import PNG_SCALE, WARNING, png, svg
+from graings.report.formatting import count
 from graings.report.render_plot import render_figure
 from graings.report.training_plot import training_figure
 from graings.report.work_precision import pareto
@@ -242,3 +243,10 @@ def test_labels_of_equal_settings_do_not_cover_each_other() -> None:
     heights = sorted(text.get_position()[1] for text in page.texts if text.get_text() in labels)
     assert len(heights) == 3
     assert min(after - before for before, after in pairwise(heights)) >= 12
+
+
+@pytest.mark.parametrize(
+    ("number", "text"), [(0, "0"), (999, "999"), (1000, "1k"), (41_500, "41.5k"), (2.56e6, "2.56M")]
+)
+def test_a_count_is_written_in_thousands_or_millions(number: float, text: str) -> None:
+    assert count(number) == text
