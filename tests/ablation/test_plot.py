@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import statistics
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -11,28 +12,28 @@ from matplotlib.figure import Figure
 
 from graings.ablation.plot import differences_figure
 from graings.ablation.rows import FULL, ROWS, Row
-from graings.ablation.table import document
 from graings.report.figure_files import PNG_SCALE, png, svg
 
 MINUS = "\N{MINUS SIGN}"
 
 
-def table(psnr: dict[str, Sequence[float | None]], rows: Sequence[Row] = ROWS) -> dict[str, Any]:
-    """A table of runs without training: PSNR by row and seed, None where a run is not finished."""
-    seeds = range(max(map(len, psnr.values()), default=1))
-    facts = {
-        "capture": {"name": "tiny", "hash": "h", "views": 20, "width": 40, "height": 30},
-        **{"options": {"preset": "draft", "iterations": 1100}, "changed_options": {}, "seeds": list(seeds)},
-    }
-    return document(facts, [(row, dict(enumerate(map(metrics, psnr.get(row.name, (None,)))))) for row in rows])
-
-
-def metrics(psnr: float | None) -> dict[str, Any] | None:
-    if psnr is None:
-        return None
+def table(differences: Mapping[str, Sequence[float | None]], full: float | None, rows: Sequence[Row] = ROWS) -> Any:
+    """What the figure reads of a table: differences by row and seed, None where a run is not finished."""
+    seeds = max(map(len, differences.values()), default=1)
     return {
-        **{"splits": {"val": {"psnr": psnr, "ssim_3dgs": 0.9}}, "gaussians": 1000, "anchors": 100, "train_s": 60.0},
-        **{"versions": {"commit": "c"}, "machine": {"cpu": "m"}},
+        "capture": {"name": "tiny", "views": 20, "width": 40, "height": 30},
+        **{"options": {"iterations": 1100}, "seeds": list(range(seeds))},
+        "rows": [row_of(row, differences.get(row.name, [None] * seeds), full) for row in rows],
+    }
+
+
+def row_of(row: Row, differences: Sequence[float | None], full: float | None) -> dict[str, Any]:
+    known = [value for value in differences if value is not None]
+    mean = statistics.fmean(known) if known else None
+    return {
+        **{"name": row.name, "label": row.label, "runs": [{"difference": value} for value in differences]},
+        **{"difference": {"mean": mean}, "psnr": {"mean": None if full is None or mean is None else full + mean}},
+        "paper": None if row.paper is None else {"difference": row.paper.difference},
     }
 
 
@@ -42,11 +43,11 @@ def words(figure: Figure) -> list[str]:
 
 
 def test_a_row_shows_its_seeds_their_mean_and_the_papers_difference() -> None:
-    figure = differences_figure(table({FULL: (30.0, 31.0), "no_residual": (29.5, 30.0)}))
+    figure = differences_figure(table({FULL: (0.0, 0.0), "no_residual": (-0.5, -1.0)}, full=30.5))
     _, seeds, means, papers = figure.axes[1].lines
-    assert list(seeds.get_xdata()) == pytest.approx([-0.5, -1.0])
+    assert list(seeds.get_xdata()) == [-0.5, -1.0]
     assert len(set(seeds.get_ydata())) == 2
-    assert list(means.get_xdata()) == pytest.approx([-0.75])
+    assert list(means.get_xdata()) == [-0.75]
     assert sorted(papers.get_xdata()) == sorted(row.paper.difference for row in ROWS if row.paper and row.name != FULL)
     summary = "full 30.50 dB on 20 validation views · 40 x 30 · 1,100 iterations · 2 seeds"
     assert {f"{MINUS}0.75 dB", summary} < set(words(figure))
@@ -55,13 +56,13 @@ def test_a_row_shows_its_seeds_their_mean_and_the_papers_difference() -> None:
 
 
 def test_a_table_without_a_finished_run_names_its_rows() -> None:
-    texts = words(differences_figure(table({})))
+    texts = words(differences_figure(table({}, full=None)))
     assert texts.count("not measured yet") == len(ROWS) - 1
     assert {row.label for row in ROWS if row.name != FULL} < set(texts)
 
 
-@pytest.mark.parametrize(("rows", "psnr"), [((), (30.0,)), (ROWS[:1], (None,)), (ROWS[:2], (30.0, None, 30.0))])
-def test_few_rows_and_equal_numbers_make_a_figure_too(rows: Sequence[Row], psnr: Sequence[float | None]) -> None:
-    document = table({row.name: psnr for row in ROWS}, rows)
+@pytest.mark.parametrize(("rows", "values"), [((), (0.0,)), (ROWS[:1], (None,)), (ROWS[:2], (0.0, None, 0.0))])
+def test_few_rows_and_equal_numbers_make_a_figure_too(rows: Sequence[Row], values: Sequence[float | None]) -> None:
+    document = table({row.name: values for row in rows}, 30.0, rows)
     assert svg(differences_figure(document)) == svg(differences_figure(document))
     assert int.from_bytes(png(differences_figure(document))[16:20]) == PNG_SCALE * 960
