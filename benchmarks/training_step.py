@@ -52,10 +52,10 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     """One step taken apart; returns the number of Gaussians drawn."""
     trainer.iteration += 1
     trainer.scene.temporal = trainer.phase(trainer.iteration).temporal
-    frames = trainer.next_frames()
+    frames = trainer.views.next(trainer.iteration)
     watch.start()
     targets = [torch.from_numpy(trainer.images.rgb(frame)) for frame in frames]
-    for view in trainer._upcoming():
+    for view in trainer.views.upcoming(trainer.iteration):
         trainer.images.prefetch(trainer.pyramid.at(trainer.iteration + 1).frames[view])
     watch.lap("images")
     compositions = trainer.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
@@ -76,7 +76,7 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
         leaves += own
         grads += gradients
         screen.append((at_centres, result.radii.amax(-1) > 0))
-    regulariser = trainer.regularisers(compositions, [frame.time for frame in frames])
+    regulariser = trainer.objective.regularisers(trainer.scene, compositions, [frame.time for frame in frames])
     watch.lap("regularisers forward (a second time of DeformNet)")
     torch.autograd.backward(
         [*leaves, *([regulariser] if regulariser.requires_grad else [])],

@@ -1,13 +1,8 @@
-"""Evaluation: how close rendered views come to held-out images.
-
-Knows nothing of training.
-"""
+"""Evaluation: how close rendered views come to held-out images."""
 
 from __future__ import annotations
 
 import hashlib
-import statistics
-import time
 from collections.abc import Iterator, Sequence
 
 from numpy.typing import ArrayLike
@@ -38,18 +33,8 @@ def evaluate(
 
 
 def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:
-    """At most `size` frames chosen by the hash of their names: fixed for a capture, spread over it."""
+    """At most `size` frames, chosen by the hash of their names: always the same, and spread over the capture."""
     if len(frames) <= size:
         return tuple(frames)
     order = sorted(range(len(frames)), key=lambda i: hashlib.sha256(frames[i].name.encode()).digest())
     return tuple(frames[i] for i in sorted(order[:size]))
-
-
-def frames_per_second(scene: Scene, frames: Sequence[Frame], background: Sequence[float]) -> float:
-    """Median speed of rendering `frames` at their size after one to warm up, networks included."""
-    seconds = []
-    for frame in (frames[0], *frames):
-        started = time.perf_counter()
-        render(scene, frame.camera, frame.time, background)
-        seconds.append(time.perf_counter() - started)
-    return 1.0 / max(statistics.median(seconds[1:]), 1e-9)

@@ -7,6 +7,8 @@ waits for a core which another process may hold, and its sums would depend on th
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
@@ -39,3 +41,14 @@ def use_threads(count: int | None) -> int:
     set_threads(count)
     keep_freed_memory()
     return thread_count()
+
+
+@contextmanager
+def computing_threads(count: int | None) -> Iterator[int]:
+    """Compute with `count` CPU threads inside the context (None: all usable cores); as before after it."""
+    before, torch_before = _threads, torch.get_num_threads()
+    try:
+        yield use_threads(count)
+    finally:
+        set_threads(before)
+        torch.set_num_threads(torch_before)

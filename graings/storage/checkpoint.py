@@ -1,9 +1,9 @@
 """Checkpoint: a model on disk, and everything needed to continue training it.
 
-A run folder holds `checkpoints/<iteration>/` with `scene.safetensors` (the model), `state.safetensors` (what
-only training needs) and `checkpoint.json` (the rest); `checkpoints/best/` holds the same of the moment that held-out
-views liked best so far, which may be delivered when training diverges. A checkpoint appears whole or not at all: it
-is written to a temporary folder, flushed and renamed. No pickle anywhere. Knows nothing of captures or jobs.
+A run folder holds `checkpoints/<iteration>/` with `scene.safetensors` (the model), `state.safetensors` (what only
+training needs) and `checkpoint.json` (the rest); `checkpoints/best/` holds the same of the iteration with the highest
+held-out PSNR so far, which is the result where training diverges. A checkpoint appears whole or not at all: it is
+written to a temporary folder, synced to disk and renamed. No pickle.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ KEEP = 2
 LOG = logging.getLogger(__name__)
 Read = TypeVar("Read")
 
-_LEFT = "an earlier checkpoint is used if there is one, else train again"
+_REMEDY = "an earlier checkpoint is used if there is one, else train again"
 
 _SCENE_FILE = "scene.safetensors"
 _STATE_FILE = "state.safetensors"
@@ -69,8 +69,8 @@ def save_checkpoint(
 ) -> Path:
     """Write a checkpoint and drop all but the last two. Returns its folder; `CheckpointError` on a full disk.
 
-    `best` writes the one beside them that is kept until a better one comes. `instead_of_later` drops later ones
-    as well, because training has given them up: this one is then the newest.
+    `best` writes the one beside them that is kept until a better one comes. `instead_of_later` removes later ones
+    as well, after training has diverged: this one is then the newest.
     """
     folder = run / CHECKPOINTS
     name = BEST if best else f"{iteration:08d}"
@@ -103,7 +103,7 @@ def save_checkpoint(
         old = folder / f".{name}.old"
         shutil.rmtree(old, ignore_errors=True)
         if final.exists():
-            # The same iteration again (finishing right after a periodic checkpoint): the new one replaces it.
+            # The same iteration again (the end right after a periodic checkpoint): the new one replaces it.
             final.rename(old)
         part.rename(final)
         shutil.rmtree(old, ignore_errors=True)
@@ -139,7 +139,9 @@ def load_state(folder: Path) -> TrainingState:
     try:
         return TrainingState(load_file(folder / _STATE_FILE), _read_facts(folder)["state"])
     except (OSError, SafetensorError, KeyError) as error:
-        raise CheckpointError(f"{folder}: damaged training state ({error!r}). Remove this folder; {_LEFT}.") from error
+        raise CheckpointError(
+            f"{folder}: damaged training state ({error!r}). Remove this folder; {_REMEDY}."
+        ) from error
 
 
 def _model(folder: Path) -> Model:
@@ -147,11 +149,11 @@ def _model(folder: Path) -> Model:
     try:
         return model_from(facts, load_file(folder / _SCENE_FILE), facts["digest"], folder)
     except (OSError, SafetensorError, ValidationError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise CheckpointError(f"{folder}: damaged checkpoint ({error!r}). Remove this folder; {_LEFT}.") from error
+        raise CheckpointError(f"{folder}: damaged checkpoint ({error!r}). Remove this folder; {_REMEDY}.") from error
 
 
 def _newest_readable(path: Path, read: Callable[[Path], Read]) -> Read:
-    """`read` of a checkpoint folder, or of a run's newest one that is whole; what is passed over is said in the log."""
+    """`read` of a checkpoint folder, or of a run's newest one that can be read; skipped ones are logged."""
     if (path / FACTS_FILE).is_file():
         return read(path)
     first: CheckpointError | None = None
@@ -162,7 +164,7 @@ def _newest_readable(path: Path, read: Callable[[Path], Read]) -> Read:
             first = first or error
             continue
         if first is not None:
-            LOG.warning("%s Going on with %s.", first, folder)
+            LOG.warning("%s Continuing with %s.", first, folder)
         return found
     if first is not None:
         raise first
@@ -173,7 +175,9 @@ def _read_facts(folder: Path) -> dict[str, Any]:
     try:
         facts = json.loads((folder / FACTS_FILE).read_text())
     except (OSError, ValueError) as error:
-        raise CheckpointError(f"{folder / FACTS_FILE}: not readable ({error}). Remove this folder; {_LEFT}.") from error
+        raise CheckpointError(
+            f"{folder / FACTS_FILE}: not readable ({error}). Remove this folder; {_REMEDY}."
+        ) from error
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         raise CheckpointError(f"{folder / FACTS_FILE}: not in the format {FORMAT}. It was written by another version.")
     return facts

@@ -1,9 +1,8 @@
-"""Compact: a model as one small file that is enough to render it.
+"""The compact file: a model as one small file that is enough to render it.
 
-Features and opacities are rounded to half precision where that can hold them, anchors that no time and no camera can
-show are left out, birth numbers become ranks, and the whole is compressed. Networks and whatever places a Gaussian stay
-as they are: two that nearly touch would change places in depth, and a pixel its colour by a tenth. Knows nothing of
-training.
+Features and opacity offsets are rounded to float16 where they fit, anchors that no camera at any time can see are left
+out, uids become ranks, and the whole is compressed with gzip. Networks and everything that positions a Gaussian stay in
+float32: otherwise two Gaussians at nearly the same depth could swap their order, which changes a pixel by up to 0.1.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ SUFFIX: Final = ".graings"
 
 _FACTS: Final = "graings"
 
-# Rows of the scaffold that half precision is enough for.
+# Rows of the scaffold for which float16 is enough.
 _HALVED: Final = ("features", "opacity_offsets")
 
 
@@ -47,15 +46,15 @@ def write_compact(model: Model, path: Path) -> int:
     tensors = {name: tensor.detach() for name, tensor in model.scene.state_dict().items()}
     for name in _HALVED:
         halved = tensors[f"scaffold.{name}"].half()
-        if bool(halved.isfinite().all()):  # half precision ends at 65 504; what is larger must not become infinite
+        if bool(halved.isfinite().all()):  # float16 ends at 65 504; larger values must not become infinite
             tensors[f"scaffold.{name}"] = halved
     order = tensors["scaffold.uids"].argsort()
-    # Asked of what is written, so that a file read and written again is the same file.
+    # Tested on the values that are written, so that a file read and written again is the same file.
     seen = can_be_seen(model.scene, *(tensors[f"scaffold.{name}"].float() for name in _HALVED))
     order = order[seen[order]]
     for name in Scaffold.ROWS:
         tensors[f"scaffold.{name}"] = tensors[f"scaffold.{name}"][order]
-    # Ties between Gaussians are broken by the order of birth, which their order in the file keeps.
+    # Ties of depth are broken by uid; the order of rows in the file preserves that order.
     del tensors["scaffold.uids"]
     facts = model_facts(
         scene=model.scene,
@@ -67,12 +66,12 @@ def write_compact(model: Model, path: Path) -> int:
         finished=model.finished,
     )
     plain = {name: tensor.contiguous() for name, tensor in tensors.items()}
-    # One entry, because the library orders several by chance.
+    # One metadata entry, because the library writes several in random order.
     data = save(plain, {_FACTS: json.dumps({"format": FORMAT, **facts}, allow_nan=False)})
     packed = gzip.compress(data, mtime=0)
     if not path.name or path.is_dir():
         raise CheckpointError(f"{path}: is a folder where a file is wanted. Name a file in it.")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")  # two may write at once; the last one stays
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")  # two processes may write at once; the last one wins
     try:
         part.write_bytes(packed)
         part.replace(path)
@@ -111,13 +110,10 @@ def open_model(path: Path) -> Model:
 def can_be_seen(
     scene: Scene, features: Float[Tensor, "anchor feature"], opacity_offsets: Float[Tensor, " anchor"]
 ) -> Bool[Tensor, " anchor"]:
-    """Which anchors with these rows have a child that may be drawn at some time from somewhere.
-
-    The others never change a pixel.
-    """
+    """Which anchors have a child that may be drawn at some time from some camera; the others never change a pixel."""
     with torch.no_grad():
         logits = scene.appearance.highest_opacity_logits(features)
         highest = torch.tanh(logits + opacity_offsets.unsqueeze(-1)).amax(-1)
-    # The residual is bounded; a hundredth of its bound covers what rounding does to a score.
+    # The residual of opacity is bounded; one hundredth more covers rounding.
     reach = 1.01 * scene.residual.scale if scene.residual is not None else 0.0
     return highest > constants.ALPHA_MIN - reach

@@ -1,7 +1,4 @@
-"""Model: a trained scene with what is needed to look at it, and that as JSON facts beside tensors.
-
-Knows nothing of how files hold it.
-"""
+"""Model: a trained scene with everything needed to render it, as JSON facts beside tensors."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ from graings.scene.scene import Scene
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """A trained scene with what is needed to look at it: units, background and the capture's views."""
+    """A trained scene with everything needed to render it: units, background and the capture's views."""
 
     scene: Scene
     units: Units
@@ -37,7 +34,7 @@ class Model:
 
 
 def scene_bytes(scene: Scene) -> int:
-    """Bytes of everything needed to render, float32 (decision 22); uids break ties and count."""
+    """Bytes of everything needed to render, in float32; uids count, because they break ties of depth."""
     return sum(t.numel() * t.element_size() for t in scene.state_dict().values())
 
 
@@ -68,7 +65,7 @@ def model_facts(
 def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: str, path: Path) -> Model:
     """The model of `model_facts` and the tensors of its scene, as read from `path`.
 
-    Raises `CheckpointError` for options of another version, and whatever broken facts provoke.
+    Raises `CheckpointError` for options that do not fit, and `KeyError`, `TypeError` or `ValueError` for damaged facts.
     """
     config = restored(TrainConfig, facts["config"], path)
     shape = restored(SceneConfig, facts["scene_config"], path)

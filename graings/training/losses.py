@@ -1,8 +1,7 @@
-"""The loss terms on the model itself as pure functions, each with its equation, and that on a picture's alpha;
-`graings.raster.photometric` is that on its colours.
+"""Loss terms as pure functions, each with its equation: those on the model itself, and that on alpha.
 
-Reductions are means over Gaussians (decision 10), or over pixels: a sum would change the balance with every
-growth. Knows nothing of schedules or optimisers.
+`graings.raster.photometric` is the term on colours. Reductions are means over Gaussians or pixels: with sums the
+balance of the terms would change with every growth.
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ from torch.nn import functional
 
 from graings.scene.deformation import Deformation
 
-# A strain well above this costs in proportion, so that joints may bend for the price of what they bend; one well below,
-# with its square, so that what hardly moves is left alone.
+# The cost of a strain is linear well above this, so that joints may bend, and quadratic well below.
 SLIGHT_STRAIN: Final = 0.01
 
-LEVEL: Final = 1 / 255  # of a picture file; a smaller difference in alpha may be the file's rounding
+LEVEL: Final = 1 / 255  # of an 8-bit image; a smaller difference in alpha may be rounding
 
 
 def temporal(
@@ -45,22 +43,22 @@ def residual(change: Float[Tensor, "gaussian 4"]) -> Tensor:
 
 
 def alpha(drawn: Float[Tensor, "height width"], seen: Float[Tensor, "height width"]) -> Tensor:
-    """Mean over pixels of the absolute difference between the opacity drawn and a picture's alpha, both in [0, 1].
+    """Mean over pixels of the absolute difference between rendered alpha and image alpha, both in [0, 1].
 
-    Below a `LEVEL` its square, so that the gradient fades there (Girshick's smooth L1, "Fast R-CNN", Eq. 3).
+    Below a `LEVEL` it is quadratic (Girshick's smooth L1, "Fast R-CNN", Eq. 3).
 
-    Not in the paper: on one background, a hole and a thing of the background's colour look the same, and so do empty
-    space and a veil of that colour.
+    Not in the paper: on one background, a hole and an object of the background colour look the same, and so do empty
+    space and semi-transparent Gaussians of that colour.
     """
     return functional.smooth_l1_loss(drawn, seen, beta=LEVEL)
 
 
 def rigidity(lengths: Float[Tensor, "instant pair"], weights: Float[Tensor, " pair"]) -> Tensor:
-    """Mean strain of pairs of Gaussians: how far their `lengths` at several instants are from their mean, beside it.
+    """Mean strain of pairs of Gaussians: deviation of their `lengths` at several times from the mean, relative to it.
 
-    Zero where everything moves as rigid bodies do. Not in the paper: what one camera sees of an instant says nothing of
-    depth along its rays, and neighbours do (the isometry of Luiten et al., "Dynamic 3D Gaussians", between the
-    instants of a step instead of from one frame to the next). Lengths are positive.
+    Zero for rigid motion. Not in the paper: one camera per time leaves the depth along its rays undetermined, and
+    neighbours constrain it (the isometry loss of Luiten et al., "Dynamic 3D Gaussians", between the times of a step
+    instead of consecutive frames). Lengths are positive.
     """
     mean = lengths.mean(0)
     strain = (lengths - mean) / mean.detach()
@@ -75,7 +73,7 @@ def mean_square(rows: Float[Tensor, "row _"]) -> Tensor:
 
 
 class _SquaredLength(torch.autograd.Function):
-    """Sum of squares; as square().sum() it goes through memory five times on its way back, and it is asked often."""
+    """Sum of squares. The backward pass of square().sum() goes through memory five times, this one once."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:

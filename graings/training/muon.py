@@ -1,10 +1,9 @@
-"""Muon: momentum whose singular values are made equal, for the weight matrices of networks.
+"""Muon: orthogonalised momentum for the weight matrices of networks.
 
-A weight matrix in a deep network gets gradients of few directions; Adam follows those and leaves the rest behind. Here
-the momentum's singular vectors keep their place and all its singular values become about 1, so rare directions move as
-far as common ones (Jordan et al. 2024, "Muon"; the scale that matches Adam's rates is that of Liu et al. 2025).
-`torch.optim.Muon` is the same in bfloat16, where a CPU without that format takes 32 ms a step instead of 2; tests
-use it as the oracle. Knows nothing of scenes, groups or schedules.
+The gradient of a weight matrix is dominated by few directions, which Adam follows. Muon keeps the singular vectors of
+the momentum and makes all its singular values about 1, so that rare directions move as far as common ones (Jordan et
+al. 2024; the scale that matches Adam's learning rates is that of Liu et al. 2025). `torch.optim.Muon` computes in
+bfloat16, which takes 32 ms a step instead of 2 on a CPU without that format; tests use it as the reference.
 """
 
 from __future__ import annotations
@@ -23,12 +22,12 @@ MOMENTUM: Final = 0.95
 QUINTIC: Final = (3.4445, -4.7750, 2.0315)
 ITERATIONS: Final = 5
 
-# A matrix whose norm is below this is taken for nothing and moves less: 1e-15, as for Adam, for each of 1 000 entries.
+# A matrix whose norm is below this counts as zero: 1e-15, the epsilon of Adam, for each of 1 000 entries.
 MIN_NORM: Final = 1e-12
 
-# Entries below this share of a matrix's norm count as none. They decide no digit of the step, but a hidden unit that
-# nothing wakes any more leaves momentum that fades by a twentieth a step, for ever, and its fourth powers would be
-# subnormal numbers, each of which costs some CPUs 150 cycles: two hundred milliseconds a step instead of two.
+# Entries below this share of a matrix's norm are set to zero. They do not affect the step, but the momentum of an
+# inactive hidden unit decays by a twentieth per step, and its fourth powers would become subnormal numbers, each of
+# which costs some CPUs 150 cycles: 200 ms a step instead of 2.
 DROP_BELOW: Final = 1e-9
 
 # Root mean square of an Adam update at rate 1, roughly: with it the same rate fits both.
@@ -36,7 +35,7 @@ ADAM_RMS: Final = 0.2
 
 
 class Muon:
-    """Steps for weight matrices. `momenta` are the running means of their gradients, in the order of `parameters`."""
+    """The optimiser of weight matrices; `momenta` are running means of gradients, in the order of `parameters`."""
 
     def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
         for parameter in parameters:
@@ -61,11 +60,11 @@ def orthogonal(matrix: Float[Tensor, "row column"]) -> Float[Tensor, "row column
 
     A matrix whose norm is below `MIN_NORM` is scaled by it instead, so 0 stays 0. Source: Jordan et al. 2024.
     """
-    # In double precision, in which no square of a single overflows.
+    # In float64, in which the square of a float32 does not overflow.
     norm = torch.linalg.vector_norm(matrix, dtype=torch.float64)
     flat = functional.hardshrink((matrix / norm.clamp_min(MIN_NORM)).to(matrix.dtype), DROP_BELOW)
     upright = flat.shape[0] > flat.shape[1]
-    if upright:  # the products of the short side are the cheaper ones
+    if upright:  # products along the shorter side are cheaper
         flat = flat.mT
     a, b, c = QUINTIC
     for _ in range(ITERATIONS):

@@ -1,7 +1,5 @@
-"""Optimizer: Adam over named groups with log-linear rates, Muon for the matrices that make motion, and rows that come
-and go with the anchors.
-
-Knows nothing of why an anchor is added or removed.
+"""Optimizer: Adam over named groups with log-linear learning rates, Muon for hidden weight matrices, and rows of
+moments that are added and removed with the anchors.
 """
 
 from __future__ import annotations
@@ -19,11 +17,12 @@ from graings.scene.scene import Scene
 from graings.training.guard.guard import Gradient
 from graings.training.muon import Muon
 
-# Rates are those of one view a step; with more they rise by this power of their number. Steps of four views at 1.5
-# times the rates end where twice as many steps of two views do (docs/experiments.md).
+# Learning rates are those of one view per step; with more views they are multiplied by their number to this power.
+# Steps of four views at 1.5 times the rates reach the same quality as twice as many steps of two views
+# (docs/experiments/).
 BATCH_POWER = 1 / 3
 
-ADAM_EPSILON = 1e-15  # gradients of one Gaussian are tiny; the usual 1e-8 would damp them (3DGS)
+ADAM_EPSILON = 1e-15  # as 3DGS: gradients of one Gaussian are tiny, and the usual 1e-8 would damp them
 
 MOMENTUM_OF = "momentum"
 
@@ -42,11 +41,11 @@ _GROUPS = {
     "deformation": "deformation",
 }
 
-# Groups whose weight matrices Muon steps: what moves is found far sooner. Last layers, biases and codes stay Adam's.
+# Groups whose hidden weight matrices Muon steps: motion is learned in fewer steps. The rest is stepped by Adam.
 _ORTHOGONAL = ("deformation", "static")
 MATRICES = "matrices"  # the rate of all of them
 
-# Groups that first move in the joint phase: their schedule spans it.
+# Groups that are trained in the joint phase only: their schedule spans it.
 TEMPORAL_GROUPS = ("residual", "deformation")
 
 
@@ -72,7 +71,7 @@ class Optimizer:
     def __init__(self, scene: Scene, config: TrainConfig, joint_from: int, views: int = 1) -> None:
         self.scene = scene
         self.rates: RatesConfig = config.rates
-        self.gain = views**BATCH_POWER
+        self.batch_factor = views**BATCH_POWER
         self.iterations = config.iterations
         self.joint_from = joint_from
         self.damping = 1.0
@@ -90,16 +89,16 @@ class Optimizer:
         self.muon = Muon(matrices)
 
     def rate(self, group: str, iteration: int, like: str | None = None) -> float:
-        """Learning rate of `group` at `iteration` (from 1): log-linear from first to last, more for more views.
+        """Learning rate of `group` at `iteration` (from 1): log-linear, times the factor for the views per step.
 
-        It runs over the iterations in which `like` (left out: the group itself) moves.
+        It spans the iterations in which `like` (default: the group itself) is trained.
         """
         first, last = getattr(self.rates, group)
         start = self.joint_from if (like or group) in TEMPORAL_GROUPS else 0
         progress = min(1.0, max(0.0, (iteration - start) / max(1, self.iterations - start)))
         if first <= 0 or last <= 0:
-            return self.gain * float(first + (last - first) * progress)
-        return self.gain * math.exp(math.log(first) + (math.log(last) - math.log(first)) * progress)
+            return self.batch_factor * float(first + (last - first) * progress)
+        return self.batch_factor * math.exp(math.log(first) + (math.log(last) - math.log(first)) * progress)
 
     def step(self, iteration: int) -> None:
         """Apply the gradients at the rates of `iteration`."""
@@ -118,13 +117,12 @@ class Optimizer:
         ]
 
     def limit(self, group: str, times: float, norm: float) -> None:
-        """Limit the gradients of `group`: no entry above `times` its own usual size, and all together at most `norm`.
+        """Clip the gradients of `group`: each entry to `times` its usual size, and all together to the norm `norm`.
 
-        The usual size is the root of Adam's second moment as it is stored, so that `times` = 100 lets the moment grow
-        11-fold and the following steps shrink to 30 %, however young the moment is. For an entry of a matrix that Muon
-        steps it is the root mean square of the matrix's momentum: a single entry that outweighs its matrix would have
-        the steps of all others. An entry with neither is limited with its group only. A single spike thus neither
-        freezes its own parameter nor takes its matrix or its group down with it.
+        The usual size is the root of Adam's second moment as stored, so that `times` = 100 lets the moment grow 11-fold
+        and shrinks the following steps to 30 %. For an entry of a matrix stepped by Muon it is the root mean square of
+        the matrix's momentum: otherwise one entry would dominate the whole step. An entry with neither is clipped with
+        its group only. So a single spike affects neither the later steps of its parameter nor those of its group.
         """
         momenta = dict(zip(self.muon.parameters, self.muon.momenta, strict=True))
         members = [p for one in self.adam.param_groups if one["name"] == group for p in one["params"]]
@@ -140,11 +138,11 @@ class Optimizer:
             gradients.append(parameter.grad)
         left = math.hypot(*(float(torch.linalg.vector_norm(gradient.double())) for gradient in gradients))
         if left > norm:
-            # A power of two keeps every bit of the gradient, and the result does not hang on the norm's last one.
+            # A power of two keeps every bit of the gradients, whatever the last bit of the norm.
             torch._foreach_mul_(gradients, 2.0 ** math.floor(math.log2(norm / left)))
 
     def _usual_size(self, parameter: nn.Parameter, momentum: Tensor | None) -> Tensor | None:
-        """Of the gradient of each entry of `parameter`, as far as past steps tell."""
+        """Usual size of the gradient of each entry of `parameter`; None before the first step."""
         if momentum is not None:
             return momentum.square().mean().sqrt()
         state = self.adam.state.get(parameter)
@@ -192,16 +190,16 @@ class Optimizer:
         return state
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `state()` gave for a scene of the same shape."""
+        """Continue from what `state()` returned for a scene of the same shape."""
         parameters = dict(self.scene.named_parameters())
         places = {parameter: place for place, parameter in enumerate(self.muon.parameters)}
         for key, value in state.items():
             name, _, field = key.rpartition("/")
             parameter = parameters[name]
-            if parameter not in places:
-                self.adam.state[parameter][field] = value.clone()
-            elif field == MOMENTUM_OF:  # older checkpoints hold Adam's moments here: their momentum begins anew
+            if field == MOMENTUM_OF:
                 self.muon.momenta[places[parameter]] = value.clone()
+            else:
+                self.adam.state[parameter][field] = value.clone()
 
 
 def _grow(moment: Tensor, new: Tensor) -> Tensor:

@@ -1,7 +1,6 @@
-"""Average: the mean of a scene's parameters over the last steps of a training.
+"""ParameterAverage: the mean of a scene's parameters over the last steps of a training.
 
-The last steps walk to and fro around what they agree on; their mean lies closer to it than any of them (Polyak and
-Juditsky 1992). Knows nothing of schedules, losses or optimisers.
+The last steps fluctuate around an optimum; their mean is closer to it than any of them (Polyak and Juditsky 1992).
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from graings.scene.scene import Scene
 
 
 class ParameterAverage:
-    """Mean over the steps it was told of, between which no anchor may come or go."""
+    """Mean over the steps that were added; no anchor may be added or removed between them."""
 
     def __init__(self) -> None:
         self.steps = 0
@@ -23,7 +22,7 @@ class ParameterAverage:
 
     @torch.no_grad()
     def add(self, scene: Scene) -> None:
-        """Count the parameters as they are now."""
+        """Add the parameters as they are now."""
         self.steps += 1
         for name, parameter in scene.named_parameters():
             if self.steps == 1:
@@ -33,9 +32,9 @@ class ParameterAverage:
 
     @torch.no_grad()
     def apply(self, scene: Scene) -> None:
-        """Set the parameters to their means. Raises `ValueError` where nothing was counted."""
+        """Set the parameters to their means. Raises `ValueError` where no step was added."""
         if self.steps == 0:
-            raise ValueError("no step was counted")
+            raise ValueError("no step was added")
         for name, parameter in scene.named_parameters():
             parameter.copy_(self._means[name])
 
@@ -44,6 +43,6 @@ class ParameterAverage:
         return dict(self._means), {"steps": self.steps}
 
     def load(self, means: dict[str, Tensor], facts: dict[str, Any]) -> None:
-        """Continue from what `state()` gave."""
+        """Continue from what `state()` returned."""
         self._means = {name: mean.clone() for name, mean in means.items()}
         self.steps = int(facts["steps"])

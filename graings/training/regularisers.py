@@ -1,7 +1,6 @@
 """Regularisers: the terms of Eq. 14 on the model itself, weighted, for the views of one step.
 
-Chooses the pair of times and the sample of children that the temporal term compares, and the pairs of children that
-rigidity does. Knows nothing of images, schedules or optimisers.
+It samples the pair of times and the children of the temporal term, and the pairs of children of the rigidity term.
 """
 
 from __future__ import annotations
@@ -19,15 +18,14 @@ from graings.random import RandomStreams
 from graings.scene.scene import Composition, Scene
 from graings.training import losses
 
-# Rigidity pairs each child with the one at most so many places further on in the order of slots: of its own anchor, or
-# of one born near it.
+# Rigidity pairs each child with one at most so many slots later: a child of the same anchor or of one created near it.
 REACH = 30
 
-# Only pairs between these distances count, in units of the scene's extent: further apart are other bodies, and of
-# closer ones the length is rounding.
+# Pairs count between these distances, in units of the scene's extent: farther ones belong to other objects, and the
+# length of closer ones is dominated by rounding.
 MIN_DISTANCE, MAX_DISTANCE = 1e-3, 0.2
 
-# The temporal term looks at no fewer children than about this (decision 10).
+# The temporal term samples at least about this many children: the paper sums over all, which costs half a step.
 MIN_TEMPORAL_SAMPLE = 2_000
 
 
@@ -41,9 +39,9 @@ def regularisers(
 ) -> Float[Tensor, ""]:
     """lambda_1 L_temp + lambda_2 L_def + lambda_3 L_res of one step's `compositions`, and rigidity between them.
 
-    Zero in the static phase. They were composed together at `moments`, of which the first also gives L_temp its pair of
-    times: one per step (decision 10). `times` are the capture's training times, ascending; of `streams`, time_pairs
-    draws the neighbour and the sample, and child_pairs who is compared with whom.
+    Zero in the static phase. The views were composed together at the times `moments`; L_temp uses the first of them
+    and one neighbouring training time per step. `times` are the capture's training times, ascending. Of `streams`,
+    time_pairs samples the neighbour and the children, child_pairs the pairs of the rigidity term.
     """
     total = torch.zeros(())
     first = compositions[0]
@@ -87,7 +85,7 @@ def _temporal(
 
 
 def _rigidity(compositions: Sequence[Composition], extent: float, generator: torch.Generator) -> Tensor:
-    """How much the distances between children differ between these instants; canonical places are taken as they are."""
+    """Strain of distances between children over the times of a step; canonical positions get no gradient."""
     offsets = [one.deformation.position for one in compositions if one.deformation is not None]
     canonical = compositions[0].canonical_means.detach()
     step = int(torch.randint(1, REACH + 1, (1,), generator=generator))
@@ -96,7 +94,7 @@ def _rigidity(compositions: Sequence[Composition], extent: float, generator: tor
     gaps = [((places := canonical + offset)[step:] - places[:-step]) / extent for offset in offsets]
     lengths = torch.stack([(gap.square().sum(-1) + MIN_DISTANCE**2 / 4).sqrt() for gap in gaps])
     mean = lengths.detach().mean(0)
-    # A child that another view draws may be below zero in this one, and a negative weight would reward strain.
+    # The opacity of a child that only another view draws may be negative here; a negative weight would reward strain.
     opacities = torch.stack([one.gaussians.opacities.detach() for one in compositions]).amin(0).clamp_min(0.0)
     weights = torch.minimum(opacities[step:], opacities[:-step]) * ((mean > MIN_DISTANCE) & (mean < MAX_DISTANCE))
     return losses.rigidity(lengths, weights)

@@ -6,7 +6,7 @@ import torch
 
 
 class ViewSampler:
-    """Training views without replacement: every view once, in a new random order each round."""
+    """Training views without replacement: every view once per pass, in a new random order each pass."""
 
     def __init__(self, count: int, generator: torch.Generator) -> None:
         if count < 1:
@@ -16,7 +16,7 @@ class ViewSampler:
         self.remaining = torch.empty(0, dtype=torch.int64)
 
     def begin(self) -> None:
-        """Begin a new round, whatever is left of this one."""
+        """Begin a new pass, whether or not this one is complete."""
         self.remaining = torch.randperm(self.count, generator=self.generator)
 
     def next(self) -> int:

@@ -31,15 +31,14 @@ NOTHING = "no held-out view was evaluated"
 
 
 def curve(*decibels: float | None, first: int = 50, factor: float = 1.5) -> list[dict[str, Any]]:
-    return [
-        point(0.1 * first * factor**i, db, iteration=round(first * factor**i), gaussians=1000 + i)
-        for i, db in enumerate(decibels)
-    ]
+    places = [first * factor**i for i in range(len(decibels))]
+    points = [point(0.1 * x, 0.0, iteration=round(x), gaussians=1000 + i).to_json() for i, x in enumerate(places)]
+    return [{**values, "psnr": psnr} for values, psnr in zip(points, decibels, strict=True)]
 
 
 def run(name: str, *decibels: float, pace: float = 1.0, **changes: Any) -> dict[str, Any]:
     points = [point(pace * 2.0**i, db, iteration=50 * 2**i, gaussians=1000 + 500 * i) for i, db in enumerate(decibels)]
-    return part(name, *points, **changes)
+    return part(name, *points, **changes).model_dump(mode="json")
 
 
 def rendered(name: str, *points: tuple[str, float, float, float]) -> dict[str, Any]:

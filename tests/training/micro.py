@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,9 +19,10 @@ from graings.kernel import use_threads
 from graings.raster.photometric import photometric
 from graings.render import draw
 from graings.scene.scene import Scene
-from graings.training import trainer as trainer_module
+from graings.training import objective as objective_module
 from graings.training.optimizer import Optimizer
-from graings.training.trainer import StepReport, Trainer
+from graings.training.step_report import StepReport
+from graings.training.trainer import Trainer
 
 # Nothing grows or goes unless a test wants it: parameters keep their identity.
 STILL = {"density.grow_from": 30_000, "density.grow_until": 0, "density.prune_from": 30_000, "density.prune_until": 0}
@@ -59,7 +61,7 @@ def micro_trainer(capture: Path, **overrides: object) -> Trainer:
     use_threads(1)
     data = load_capture(capture, config.capture)
     images = ImageStore(config.capture.background_rgb(), config.capture.cache_mb)
-    return Trainer(data, images, config)
+    return Trainer.start(data, images, config)
 
 
 def steps(trainer: Trainer, count: int) -> list[StepReport]:
@@ -86,9 +88,9 @@ def plain_training(trainer: Trainer, dtype: torch.dtype, count: int) -> tuple[Sc
     return scene, found
 
 
-def said(reports: list[StepReport], word: str) -> list[str]:
-    """Events that begin with `word`."""
-    return [event for report in reports for event in report.events if event.startswith(word)]
+def events_of(reports: list[StepReport], kind: str | None = None) -> list[Any]:
+    """Events of this kind, or all."""
+    return [event for report in reports for event in report.events if kind in (None, event.kind)]
 
 
 def quality(trainer: Trainer) -> float:
@@ -115,13 +117,13 @@ def spoil_loss(
     monkeypatch: pytest.MonkeyPatch, trainer: Trainer, when: Callable[[int], bool], factor: float = float("nan")
 ) -> None:
     """Multiply the photometric loss by `factor` in the steps that `when` chooses."""
-    true = trainer_module.photometric
+    true = objective_module.photometric
 
     def spoiled(image: Tensor, target: Tensor, *weights: float) -> Tensor:
         value = true(image, target, *weights)
         return value * factor if when(trainer.iteration) else value
 
-    monkeypatch.setattr(trainer_module, "photometric", spoiled)
+    monkeypatch.setattr(objective_module, "photometric", spoiled)
 
 
 def first(values: Tensor, number: float) -> Tensor:

@@ -63,7 +63,7 @@ def test_a_step_weighs_the_difference_in_alpha(tmp_path: Path) -> None:
     without, weighed = (micro_trainer(capture, **{"loss.alpha": weight}) for weight in (0.0, 0.5))
     frame = weighed.capture.train[0]
     for trainer in (without, weighed):
-        trainer.next_frames = lambda: [frame]  # type: ignore[method-assign]
+        trainer.views.next = lambda iteration: [frame]  # type: ignore[method-assign]
     weighed.scene.temporal = False
     drawn = render(weighed.scene, frame.camera, frame.time, weighed.background)
     seen = weighed.images.alpha(frame)

@@ -58,5 +58,5 @@ def test_nothing_is_averaged_while_anchors_may_come_or_go(micro: Path, mark: str
 
 
 def test_a_mean_of_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="no step was counted"):
+    with pytest.raises(ValueError, match="no step was added"):
         ParameterAverage().apply(tiny_scene())

@@ -20,14 +20,14 @@ from tests.training.micro import finite, micro_trainer, quality, steps
 def watched(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """Names of the frames of every step from now on."""
     taken: list[list[str]] = []
-    choose = trainer.next_frames
+    choose = trainer.views.next
 
-    def noted() -> list[Frame]:
-        frames = choose()
+    def noted(iteration: int) -> list[Frame]:
+        frames = choose(iteration)
         taken.append([frame.name for frame in frames])
         return frames
 
-    monkeypatch.setattr(trainer, "next_frames", noted)
+    monkeypatch.setattr(trainer.views, "next", noted)
     return taken
 
 
@@ -40,7 +40,7 @@ def test_a_pass_shows_every_view_once_and_no_step_reaches_into_the_next(
     taken = watched(trainer, monkeypatch)
     for _ in range(3):
         taken.clear()
-        while not taken or trainer._upcoming():
+        while not taken or trainer.views.upcoming(trainer.iteration):
             trainer.step()
         assert sorted(name for step in taken for name in step) == sorted(names)
         assert len(taken) == -(-len(names) // batch)
@@ -57,12 +57,12 @@ def test_rates_are_those_of_the_views_a_step_can_have(micro: Path) -> None:
 
 def test_a_step_is_that_of_the_mean_loss(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = micro_trainer(
-        micro, batch=3, warmup=0, **{f"loss.l_{name}": False for name in ("temp", "def", "res", "rigid")}
+        micro, batch=3, warmup=0, **{f"loss.{name}": 0 for name in ("temporal", "deformation", "residual", "rigidity")}
     )
     steps(trainer, 5)
     before, chosen, stepped = copy.deepcopy(trainer.scene), [], {}
-    choose = trainer.next_frames
-    monkeypatch.setattr(trainer, "next_frames", lambda: chosen.extend(choose()) or list(chosen))
+    choose = trainer.views.next
+    monkeypatch.setattr(trainer.views, "next", lambda step: chosen.extend(choose(step)) or list(chosen))
     parameters = dict(trainer.scene.named_parameters())
 
     def noted(iteration: int) -> None:

@@ -17,7 +17,7 @@ from graings.training.curriculum import resolution_schedule as resolution
 from graings.training.curriculum.resolution_schedule import downscale_factor, downscaled
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
-from tests.training.micro import micro_config, micro_trainer, said, steps
+from tests.training.micro import events_of, micro_config, micro_trainer, steps
 
 
 def _camera(width: int, height: int) -> Camera:
@@ -77,12 +77,12 @@ def test_steps_see_small_pictures_first_and_then_the_photographs(micro: Path, mo
 
     monkeypatch.setattr(trainer.images, "rgb", noted)
     reports = steps(trainer, 40)
-    times = trainer.pyramid.at(1).times
+    times = trainer.pyramid.at(1).factor
     assert times > 1
     assert drawn[0] == (-(-side // times),) * 2
     assert drawn[19][0] < side
     assert drawn[20:] == [(side, side)] * 20
-    assert [event.split(":")[0] for event in said(reports, "low_resolution_until")] == ["low_resolution_until"]
+    assert len(events_of(reports, "low_resolution")) == 1
 
 
 @pytest.mark.usefixtures("begins_small")
@@ -90,7 +90,7 @@ def test_a_small_picture_is_the_mean_of_what_its_pixels_cover(micro: Path) -> No
     trainer = _trainer(micro)
     level = trainer.pyramid.at(20)
     whole, small = trainer.images.rgb(trainer.capture.train[0]), trainer.images.rgb(level.frames[0])
-    assert level.times == 2
+    assert level.factor == 2
     np.testing.assert_allclose(small, shrink(whole, small.shape[1], small.shape[0]), atol=2 / 65535)
 
 

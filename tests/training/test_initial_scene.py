@@ -27,7 +27,7 @@ from graings.training.initialization.initial_scene import (
 )
 from graings.training.initialization.triangulation import triangulate
 from tests.capture.captures import FOV, write_walled
-from tests.training.micro import GROWING, micro_trainer, quality, said, steps
+from tests.training.micro import GROWING, events_of, micro_trainer, quality, steps
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -90,10 +90,10 @@ def _first(capture: Capture, **options: object) -> InitialPoints:
 
 def test_filled_pictures_begin_with_what_pairs_of_them_agree_on(filled: Capture) -> None:
     found = triangulate(filled.train, ImageStore(WHITE))
-    agreed = np.concatenate([found.places, found.filled])
+    agreed = np.concatenate([found.points, found.filled])
     first = _first(filled)
     np.testing.assert_array_equal(first.positions, agreed)
-    counts = len(found.places), len(found.filled)
+    counts = len(found.points), len(found.filled)
     assert first.notes == (
         f"first points: {counts[0]:,} places that pairs of pictures agree on, and {counts[1]:,} between them",
     )
@@ -155,8 +155,8 @@ def test_places_that_pictures_agree_on_are_worth_their_time(filled: Capture) -> 
     for options in ({}, {"init.min_mask_fraction": 0.0, "init.points": 600}):
         trainer = micro_trainer(filled.root, iterations=300, **{"density.max_anchors": 600}, **GROWING, **options)
         reports = steps(trainer, 300)
-        assert len(said(reports[:1], "first points: ")) == (0 if options else 1)
-        assert said(reports[1:], "first points") == []
+        assert len(events_of(reports[:1], "initial_points")) == (0 if options else 1)
+        assert events_of(reports[1:], "initial_points") == []
         found.append(quality(trainer))
     print(f"{found[0]:.2f} dB, from random points {found[1]:.2f} dB")
     assert found[0] > found[1] + 2

@@ -54,7 +54,7 @@ def test_a_pass_ends_with_the_last_view_that_takes_part(micro: Path) -> None:
     ends = []
     for _ in range(3 * within):
         trainer.step()
-        ends.append(not trainer._upcoming())
+        ends.append(not trainer.views.upcoming(trainer.iteration))
     assert ends == ([False] * (within - 1) + [True]) * 3
 
 

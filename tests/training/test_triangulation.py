@@ -14,7 +14,7 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig
 from graings.training.initialization import triangulation
-from graings.training.initialization.triangulation import fill_between, ray_intersections, tracks, triangulate
+from graings.training.initialization.triangulation import fill_untextured, ray_intersections, tracks, triangulate
 from tests.capture.captures import FOV, entry, write_image, write_transforms, write_walled
 
 DISTANCE = 4.0
@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 def _places(folder: Path) -> Array:
     capture = load_capture(folder)
     found = triangulate(capture.train, ImageStore((1.0, 1.0, 1.0)))
-    assert len(found.fill_between) == 0 or len(found.places) > 0
-    return capture.units.points_back(found.places)
+    assert len(found.fill_untextured) == 0 or len(found.points) > 0
+    return capture.units.points_back(found.points)
 
 
 def _cameras(azimuths: Sequence[float]) -> list[Camera]:
@@ -71,7 +71,7 @@ def test_cameras_that_tell_no_depth_give_no_places(tmp_path: Path, azimuths: lis
 
 def test_long_clips_cost_no_more_than_their_sixty_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_walled(tmp_path, _cameras(range(0, 80, 10)))
-    monkeypatch.setattr(triangulation, "PICTURES", 3)
+    monkeypatch.setattr(triangulation, "IMAGES", 3)
     capture = load_capture(folder)
     read = []
 
@@ -90,7 +90,7 @@ def test_what_lies_between_places_is_as_deep_as_the_nearest(tmp_path: Path) -> N
     ends = np.array([[0.4 * part, 0.4 * part], [SIZE - 0.4 * part, 0.4 * part]])
     depths = np.array([2.0, 5.0])
     rays = np.column_stack([(ends - camera.cx) / camera.fx, np.ones(2)]) @ camera.world_to_camera[:3, :3]
-    guessed = fill_between(camera, camera.center + depths[:, None] * rays)
+    guessed = fill_untextured(camera, camera.center + depths[:, None] * rays)
     pixels = _pixels(camera, guessed)
     # One in the middle of each of 12 x 12 parts, but for the two corners.
     wanted = {(x, y) for x in range(12) for y in range(12)} - {(0, 0), (11, 0)}
@@ -99,17 +99,19 @@ def test_what_lies_between_places_is_as_deep_as_the_nearest(tmp_path: Path) -> N
     np.testing.assert_allclose((guessed - camera.center) @ camera.forward, np.where(left, *depths), rtol=1e-9)
     behind = camera.center - camera.forward
     assert (
-        fill_between(camera, np.stack([behind, behind])).shape == fill_between(camera, np.empty((0, 3))).shape == (0, 3)
+        fill_untextured(camera, np.stack([behind, behind])).shape
+        == fill_untextured(camera, np.empty((0, 3))).shape
+        == (0, 3)
     )
 
 
 def test_large_pictures_are_looked_at_as_small_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_walled(tmp_path, _cameras(range(0, 80, 10)))
-    monkeypatch.setattr(triangulation, "LONGEST", 64)
+    monkeypatch.setattr(triangulation, "MAX_SIFT_SIDE", 64)
     small = load_capture(folder, CaptureConfig(max_side=64))
     found, same = (triangulate(each.train, ImageStore((1.0, 1.0, 1.0))) for each in (load_capture(folder), small))
-    assert len(found.places) > 100
-    np.testing.assert_array_equal(found.places, same.places)
+    assert len(found.points) > 100
+    np.testing.assert_array_equal(found.points, same.places)
 
 
 def test_rays_meet_where_both_cameras_saw_it() -> None:

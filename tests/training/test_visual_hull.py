@@ -17,9 +17,9 @@ from graings.capture.synthetic import Array, Body, SyntheticScene, write_synthet
 from graings.config import TrainConfig, make_config
 from graings.random import RandomStreams
 from graings.training.initialization.initial_scene import initial_points
-from graings.training.initialization.visual_hull import MIN_CARVED, MIN_COVERAGE, carve, coverage, masked
+from graings.training.initialization.visual_hull import MIN_COVERAGE, MIN_POINTS, coverage, masked, visual_hull
 from tests.capture.captures import without_alpha, write_image
-from tests.training.micro import GROWING, micro_trainer, quality, said, steps
+from tests.training.micro import GROWING, events_of, micro_trainer, quality, steps
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -104,8 +104,8 @@ def test_what_flies_is_not_lost(flight: Path) -> None:
             few = {"iterations": 400, "seed": seed, "init.points": 20_000}
             trainer = micro_trainer(flight, **few, **GROWING, **options)
             reports = steps(trainer, 400)
-            assert len(said(reports[:1], "time_window: begins with the middle")) == (0 if options else 1)
-            assert said(reports[1:], "time_window") == []
+            assert len(events_of(reports[:1], "time_window")) == (0 if options else 1)
+            assert events_of(reports[1:], "time_window") == []
             found.append(quality(trainer))
         print(f"seed {seed}: by itself {found[0]:.2f} dB, the whole clip from the start {found[1]:.2f} dB")
         gains.append(found[0] - found[1])
@@ -168,7 +168,7 @@ def test_pictures_of_the_background_alone_leave_all_points(flight: Path) -> None
 def test_points_in_the_ball_are_kept_and_cover_it(flight: Path) -> None:
     data = load_capture(flight)
     views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
-    kept = carve(_grid(), views, 0.6, 50)
+    kept = visual_hull(_grid(), views, 0.6, 50)
     assert 0 < len(kept) < 0.05 * len(_grid())
     assert coverage(kept, views, 50) > MIN_COVERAGE
     assert coverage(kept + 5, views, 50) == 0
@@ -179,7 +179,10 @@ def test_what_stands_still_has_no_fog_about_it_and_what_flies_beside_it_keeps_it
     data = load_capture(accompanied)
     views = masked(data.train[16:32], ImageStore(WHITE), WHITE)
     found = []
-    for points in (carve(_grid(), views, 0.6, 1), carve(_grid(), views, 0.6, 50)):  # every point is near to one cell
+    for points in (
+        visual_hull(_grid(), views, 0.6, 1),
+        visual_hull(_grid(), views, 0.6, 50),
+    ):  # every point is near to one cell
         fog = np.linalg.norm(data.units.points_back(points), axis=-1) > 0.7  # the ball that stays has a radius of 0.5
         found.append((int(fog.sum()), len(points), coverage(points, views, 50)))
     (_, _, bare), (fog_left, count, covered) = found
@@ -190,8 +193,8 @@ def test_what_stands_still_has_no_fog_about_it_and_what_flies_beside_it_keeps_it
 def test_where_few_points_would_be_left_all_that_are_allowed_stay(flight: Path) -> None:
     data = load_capture(flight)
     views = masked(data.train[20:28], ImageStore(WHITE), WHITE)
-    many, few = (len(carve(_grid()[::step], views, 0.6, 50)) * step for step in (1, 8))
-    assert few >= 8 * MIN_CARVED
+    many, few = (len(visual_hull(_grid()[::step], views, 0.6, 50)) * step for step in (1, 8))
+    assert few >= 8 * MIN_POINTS
     assert few > 1.5 * many
 
 

@@ -1,7 +1,4 @@
-"""Pyramid: the training views at the sizes at which training looks at them.
-
-Knows nothing of images, models or losses.
-"""
+"""ImagePyramid: the training views at every resolution of the schedule."""
 
 from __future__ import annotations
 
@@ -15,29 +12,29 @@ from graings.training.curriculum.resolution_schedule import downscale_factor, do
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Level:
-    """All views at one size: so many `times` smaller along each side than the photographs."""
+class PyramidLevel:
+    """All views at one resolution: `factor` times smaller along each side than the images."""
 
-    times: int
+    factor: int
     frames: tuple[Frame, ...]
     sampling: SamplingRate
 
 
 class ImagePyramid:
-    """`frames` at every size that the schedule of `config` asks for; their content lies within `extent`."""
+    """`frames` at the resolutions of `config`'s schedule; `extent` is the radius of the content, normalised units."""
 
     def __init__(self, config: TrainConfig, frames: Sequence[Frame], extent: float) -> None:
         self._config = config
         self._frames = tuple(frames)
         self._cameras = [frame.camera for frame in frames]
         self._extent = extent
-        self._levels: dict[int, Level] = {}
+        self._levels: dict[int, PyramidLevel] = {}
 
-    def at(self, iteration: int) -> Level:
-        """What `iteration` (from 1) looks at."""
-        times = downscale_factor(self._config, self._cameras, iteration)
-        if times not in self._levels:
-            frames = tuple(replace(frame, camera=downscaled(frame.camera, times)) for frame in self._frames)
+    def at(self, iteration: int) -> PyramidLevel:
+        """The level of `iteration` (from 1)."""
+        factor = downscale_factor(self._config, self._cameras, iteration)
+        if factor not in self._levels:
+            frames = tuple(replace(frame, camera=downscaled(frame.camera, factor)) for frame in self._frames)
             sampling = SamplingRate.of([frame.camera for frame in frames], self._extent)
-            self._levels[times] = Level(times, frames, sampling)
-        return self._levels[times]
+            self._levels[factor] = PyramidLevel(factor, frames, sampling)
+        return self._levels[factor]

@@ -22,37 +22,37 @@ from graings.scene.scene import Scene
 from graings.training.curriculum.time_window import TimeWindow
 from graings.training.initialization.visual_hull import MIN_VIEWS
 
-# Mark of the 30 000 schedule at which to look: later than the slowest of the clips looked at had found what they show.
+# Mark of the 30 000 schedule at which to check: later than the slowest of the tested clips had found its objects.
 CHECK_AT: Final = 12_500
 
-# After fewer steps even what stays in place may not have been found; a run whose mark comes earlier is not looked at.
+# After fewer steps even static objects may not have been found; a run whose mark comes earlier is not checked.
 MIN_STEPS: Final = 400
 
-# Training views to look at.
+# Number of training views to check.
 VIEWS: Final = 60
 
-# Above this share of the views something is lost. Of seven clips that train well none has more than a thirtieth; three
-# in which balls are lost have 0.5 and more.
+# Above this share of the views an object counts as missing. Seven clips that train well have at most 0.03; three in
+# which a moving ball is missing have 0.5 and more.
 MAX_MISSING_FRACTION: Final = 0.3
 
-# Shares of the clip to begin again with: the first that has enough views.
+# Shares of the clip to restart with: the first that has enough views.
 RESTART_WINDOWS: Final = (0.1, 0.25)
 
-# A picture's longer side in cells; a thing is as large as this many of them each way, and lost where the colour of each
-# is wrong by this much in the mean. Rims and limbs that lag behind are thinner.
+# The longer image side in cells. An object is missing where a block of BLOCK x BLOCK cells all differ in mean colour by
+# more than COLOR_DIFFERENCE; silhouettes and limbs that are slightly misplaced are thinner.
 CELLS: Final = 50
 BLOCK: Final = 3
 COLOR_DIFFERENCE: Final = 0.3
 
 
-def look_at(config: TrainConfig) -> int | None:
-    """The iteration of an attempt after which to look, None where it has too few."""
+def check_iteration(config: TrainConfig) -> int | None:
+    """The iteration after which to check; None where the run is too short."""
     mark = config.scaled(CHECK_AT)
     return mark if mark >= MIN_STEPS else None
 
 
 def restart_window(config: TrainConfig, times: Sequence[float]) -> float | None:
-    """The share of the clip to begin again with, None where none has enough views; those of training are at `times`."""
+    """The share of the clip to restart with, for training views at `times`; None where none has enough views."""
     for share in RESTART_WINDOWS:
         window = TimeWindow(config, times, share)
         if MIN_VIEWS <= sum(window.has(view, 0) for view in range(len(times))) < len(times):
@@ -61,20 +61,20 @@ def restart_window(config: TrainConfig, times: Sequence[float]) -> float | None:
 
 
 def missing_fraction(scene: Scene, frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> float:
-    """Share of `frames` in which something that they show is lost."""
-    lost = 0
+    """Share of `frames` in which an object is missing from the render."""
+    missing = 0
     for frame in frames:
-        drawn = render(scene, frame.camera, frame.time, background).color
-        lost += has_missing_object(drawn, torch.from_numpy(images.rgb(frame)))
-    return lost / len(frames)
+        render_ = render(scene, frame.camera, frame.time, background).color
+        missing += has_missing_object(render_, torch.from_numpy(images.rgb(frame)))
+    return missing / len(frames)
 
 
-def has_missing_object(drawn: Float[Tensor, "height width 3"], shown: Float[Tensor, "height width 3"]) -> bool:
-    """Whether a block of `shown` is another colour in `drawn`, both in [0, 1]."""
-    height, width, _ = shown.shape
+def has_missing_object(render_: Float[Tensor, "height width 3"], image: Float[Tensor, "height width 3"]) -> bool:
+    """Whether a block of `image` has another colour in the render, both in [0, 1]."""
+    height, width, _ = image.shape
     cell = max(1, max(height, width) // CELLS)
-    difference = (drawn - shown).permute(2, 0, 1).unsqueeze(0)
-    wrong = functional.avg_pool2d(difference, min(cell, height, width)).abs().amax(1, keepdim=True) > COLOR_DIFFERENCE
-    if min(wrong.shape[-2:]) < BLOCK:
+    difference = (render_ - image).permute(2, 0, 1).unsqueeze(0)
+    differs = functional.avg_pool2d(difference, min(cell, height, width)).abs().amax(1, keepdim=True) > COLOR_DIFFERENCE
+    if min(differs.shape[-2:]) < BLOCK:
         return False
-    return bool((functional.avg_pool2d(wrong.float(), BLOCK, stride=1) > 1 - 1e-6).any())
+    return bool((functional.avg_pool2d(differs.float(), BLOCK, stride=1) > 1 - 1e-6).any())

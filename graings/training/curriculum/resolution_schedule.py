@@ -1,7 +1,6 @@
-"""Resolution: how much smaller than the photographs the pictures are that a step of training compares.
+"""The resolution schedule: training begins with downscaled images.
 
-Small ones come first: they say where things are and how they move, at a fraction of the cost. Knows nothing of images,
-models or losses.
+They are enough to find positions and motion, at a fraction of the cost.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ from typing import Final
 from graings.camera.camera import Camera
 from graings.config import TrainConfig
 
-MIN_SIDE: Final = 200  # px of the longest side, which is never halved below
+MIN_SIDE: Final = 200  # px; the longest side is not reduced below
 
 
 def downscale_factor(config: TrainConfig, cameras: Sequence[Camera], iteration: int) -> int:
-    """How many times smaller along each side than those of `cameras` the pictures of `iteration` (from 1) are.
+    """By which factor the images of `cameras` are downscaled along each side at `iteration` (from 1).
 
     A power of two, as large as `MIN_SIDE` allows at first; it halves at even intervals and
     is 1 after `low_resolution_until`.
@@ -31,5 +30,5 @@ def downscale_factor(config: TrainConfig, cameras: Sequence[Camera], iteration: 
 
 
 def downscaled(camera: Camera, times: int) -> Camera:
-    """The view of `camera` on a grid so many times coarser along each side."""
+    """`camera` with an image `times` smaller along each side."""
     return camera if times == 1 else camera.resized(math.ceil(camera.width / times), math.ceil(camera.height / times))

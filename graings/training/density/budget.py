@@ -1,8 +1,7 @@
-"""Budget: how many anchors a given memory holds.
+"""Budget: how many anchors fit into a given memory.
 
 Counts what grows with the anchors: rows with their gradients and moments, statistics, and the activations of one
-step in which every child is drawn. An upper bound, so that a scene that may grow at will still fits. Knows nothing
-of why anchors are added.
+step in which every child is drawn. It is an upper bound.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ from graings.scene.encoding import direction_width, encoding_width
 FLOAT: Final = 4
 MEGABYTE: Final = 1_000_000
 
-# A parameter comes with its gradient, two moments and its mean; two snapshots keep all but the gradient twice more.
+# Copies of a parameter: itself, its gradient, two moments and its average; two snapshots hold all but the gradient.
 COPIES: Final = 5 + 2 * 4
 
-# Means, quaternions, scales, opacity, colour, deformation and residual of one child in one view, and what the
-# rasterizer keeps.
+# Means, quaternions, scales, opacity, colour, deformation and residual of one child in one view, and the buffers of
+# the rasterizer.
 CHILD_FLOATS: Final = 64
 
 # Values and their gradients.
@@ -27,7 +26,7 @@ BOTH_WAYS: Final = 2
 
 
 def bytes_per_anchor(config: SceneConfig, views: int) -> int:
-    """Memory of one more anchor whose children are all drawn, with so many views a step."""
+    """Memory in bytes of one more anchor whose children are all drawn, with `views` per step."""
     k = config.children
     rows = 3 + config.feature_dim + 3 * k + 1
     statistics = 16 * k + 16
@@ -35,24 +34,24 @@ def bytes_per_anchor(config: SceneConfig, views: int) -> int:
     fixed = 20 * (1 + COPIES) + statistics * 4
     static = 3 + k + config.static_width
     deform = encoding_width(3, config.position_frequencies) + config.deform_width * config.deform_depth
-    seen = (2 if config.reflection else 1) * direction_width(config.color_sh_degree)
-    inputs, hidden = config.feature_dim + seen, 3 * config.head_width
-    if config.residual_sh_degree > 0:  # a fourth head, with inputs of its own
+    direction = (2 if config.reflection else 1) * direction_width(config.color_sh_degree)
+    inputs, hidden = config.feature_dim + direction, 3 * config.head_width
+    if config.residual_sh_degree > 0:  # a fourth head with its own inputs
         inputs += config.feature_dim + direction_width(config.residual_sh_degree)
         hidden += config.head_width
     heads = inputs + hidden + 8 * k + config.static_width
     networks = static + deform
-    if config.single_mlp or config.time_conditioning == "concatenated":  # time goes through the hidden layers
+    if config.single_mlp or config.time_conditioning == "concatenated":  # the hidden layers run once per time
         networks *= views
     activations = BOTH_WAYS * FLOAT * (k * (networks + views * CHILD_FLOATS) + views * heads)
     return FLOAT * rows * COPIES + fixed + activations
 
 
 def most_anchors(config: TrainConfig) -> int:
-    """Anchors that growth may reach: as many as are wished for, if memory holds them."""
+    """Anchors that growth may reach: `density.max_anchors`, or what memory holds if that is less."""
     return min(config.density.max_anchors, affordable_anchors(config.scene, config.batch, config.density.memory_mb))
 
 
 def affordable_anchors(config: SceneConfig, views: int, memory_mb: int) -> int:
-    """Anchors that fit into `memory_mb`; at least 16, below which nothing can be seen."""
+    """Anchors that fit into `memory_mb`; at least 16."""
     return max(16, memory_mb * MEGABYTE // bytes_per_anchor(config, views))

@@ -1,29 +1,32 @@
-"""DensityControl: when anchors are watched, grown and pruned over a run, and what that needs to remember.
+"""DensityControl: the schedule of observing, growing and pruning anchors.
 
-`density` decides which; this asks it when the schedule says so and has scene, optimizer and statistics follow. Knows
-nothing of images, losses or guards.
+`growth` decides which anchors; this module applies the decisions to scene, optimiser and statistics.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from graings.capture.capture import Frame
 from graings.config import TrainConfig
-from graings.scene.scene import Scene
+from graings.raster.result import RenderResult
+from graings.report.events import Event, Grew, GrowthCapped, Pruned, Thinned
+from graings.scene.scene import Composition, Scene
 from graings.training.density import growth
 from graings.training.density.budget import most_anchors
 from graings.training.density.statistics import DensityStatistics
 from graings.training.guard.collapse import mean_logits
 from graings.training.optimizer import Optimizer
 
-# With more of the anchors' budget taken than this, growth first removes those that show nothing.
+# Above this share of the budget, growth first prunes faint anchors.
 NEAR_BUDGET = 0.9
 
-# Where more anchors stand than may, and nine tenths of them have been seen often enough for what shows nothing to have
-# gone, those that are left are thinned to this share of the budget. Nothing could be born for the rest of the run.
+# Where the initial anchors exceed the budget and nine tenths of them were visited often enough to be pruned, the rest
+# is thinned to this share of the budget: otherwise no anchor could be added for the rest of the run.
 MIN_OBSERVED_FRACTION = 0.9
 THINNED_FRACTION = 0.5
 
@@ -39,10 +42,28 @@ class DensityControl:
         self.statistics = DensityStatistics(scene.scaffold.count, scene.scaffold.slots)
 
     def watches(self, iteration: int) -> bool:
-        """Whether what `iteration` draws counts for the next growth or pruning."""
+        """Whether `iteration` is observed for the next growth or pruning."""
         last_growth = self.scaled(self.config.grow_until)
         growing = self.scaled(self.config.statistics_from) < iteration <= last_growth
         return growing or last_growth < iteration <= self.scaled(self.config.prune_until)
+
+    def observe(
+        self,
+        frames: Sequence[Frame],
+        compositions: Sequence[Composition],
+        results: Sequence[RenderResult],
+        offsets: Sequence[Tensor],
+    ) -> None:
+        """Record the views of one step; `offsets` hold dL/d(projected centre), L being the mean over views."""
+        for frame, composition, result, offset in zip(frames, compositions, results, offsets, strict=True):
+            if offset.grad is not None:
+                self.statistics.observe(
+                    composition.children,
+                    offset.grad * len(frames),  # of the view's own loss, not of the mean
+                    result.radii.amax(-1) > 0,
+                    composition.opacities,
+                    (frame.camera.width, frame.camera.height),
+                )
 
     def grows(self, iteration: int) -> bool:
         """Whether anchors may be added after `iteration`."""
@@ -50,19 +71,24 @@ class DensityControl:
         return first <= iteration <= last and iteration % self.config.grow_every == 0
 
     def prunes(self, iteration: int) -> bool:
-        """Whether anchors that show nothing go after `iteration`."""
+        """Whether faint anchors are removed after `iteration`."""
         first, last = self.scaled(self.config.prune_from), self.scaled(self.config.prune_until)
         return first <= iteration <= last and iteration % max(1, self.scaled(self.config.prune_every)) == 0
 
-    def grow(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> tuple[int, list[str]]:
-        """Add anchors where the pictures ask for them; returns how many, and what happened in words."""
-        events: list[str] = []
-        # Anchors that show nothing would keep others from growing for good: what is not drawn does not come back.
+    def grow(
+        self, iteration: int, scene: Scene, optimizer: Optimizer, generator: torch.Generator
+    ) -> tuple[int, list[Event]]:
+        """Add anchors where the gradients of the projected centres are large; returns how many, and what happened.
+
+        `iteration` is that of the run, for the events.
+        """
+        events: list[Event] = []
+        # Faint anchors would use up the budget for good: what is not drawn gets no gradient and does not recover.
         if scene.scaffold.count > NEAR_BUDGET * self.config.max_anchors:
-            judged = float((self.statistics.visits > self.config.prune_min_views).double().mean())
-            events = self.prune(scene, optimizer)
-            if judged > MIN_OBSERVED_FRACTION and scene.scaffold.count > self.config.max_anchors:
-                events += self._thin(scene, optimizer, generator)
+            visited = float((self.statistics.visits > self.config.prune_min_views).double().mean())
+            events = self.prune(iteration, scene, optimizer)
+            if visited > MIN_OBSERVED_FRACTION and scene.scaffold.count > self.config.max_anchors:
+                events += self._thin(iteration, scene, optimizer, generator)
         grown = growth.grow(
             scene.scaffold,
             self.statistics,
@@ -72,36 +98,37 @@ class DensityControl:
             self.next_uid,
             generator,
         )
-        self.statistics.forget_grown(self.config.min_observations)
+        self.statistics.reset_grown(self.config.min_observations)
         if grown.capped:
-            events.append("growth_capped: the budget of anchors is used up or too many wanted to grow")
+            anchors = scene.scaffold.count + len(grown)
+            events.append(GrowthCapped(iteration=iteration, anchors=anchors, max_anchors=self.config.max_anchors))
         if len(grown) > 0:
             optimizer.append(grown.rows)
             self.statistics.resize(append=len(grown))
             self.next_uid += len(grown)
-            events.insert(0, f"grew {len(grown)} anchors")
+            events.insert(0, Grew(iteration=iteration, anchors=len(grown)))
         return len(grown), events
 
-    def prune(self, scene: Scene, optimizer: Optimizer) -> list[str]:
-        """Remove anchors that show nothing; returns what happened, in words."""
+    def prune(self, iteration: int, scene: Scene, optimizer: Optimizer) -> list[Event]:
+        """Remove anchors that show nothing; returns what happened. `iteration` is that of the run."""
         keep = growth.prune(scene.scaffold, self.statistics, self.config)
-        self.statistics.forget_judged(self.config.prune_min_views)
+        self.statistics.reset_pruned(self.config.prune_min_views)
         removed = int((~keep).sum())
         if removed == 0:
             return []
         optimizer.keep(keep)
         self.statistics.resize(keep=keep)
-        return [f"pruned {removed} anchors"]
+        return [Pruned(iteration=iteration, anchors=removed)]
 
-    def _thin(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> list[str]:
-        """Make room where what stood from the first is more than may be; returns what happened, in words."""
+    def _thin(self, iteration: int, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> list[Event]:
+        """Make room for growth where the initial anchors are more than the budget; returns what happened."""
         count, most = scene.scaffold.count, max(2, int(THINNED_FRACTION * self.config.max_anchors))
         keep, wider = growth.thin_out(scene.scaffold, self.statistics, most, generator)
         with torch.no_grad():
             scene.scaffold.log_scales.add_(wider.unsqueeze(-1))
         optimizer.keep(keep)
         self.statistics.resize(keep=keep)
-        return [f"thinned {count} anchors to {most}: more stood from the first than the budget holds"]
+        return [Thinned(iteration=iteration, anchors_before=count, anchors_after=most)]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Statistics, and facts as JSON."""

@@ -1,7 +1,6 @@
-"""Density: where anchors should grow and which may go (decisions only; the optimizer resizes).
+"""Where anchors grow and which are pruned: decisions only, the optimiser resizes the scene.
 
-Growth follows the mean screen-space gradient of each child (Eq. 6) on a multi-resolution voxel grid. Knows
-nothing of rendering; it is told gradients, observations and opacities.
+Growth follows the mean screen-space gradient of each child (Eq. 6) on a multi-resolution voxel grid.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from graings.training.density.statistics import DensityStatistics
 # Never prune below this many anchors.
 MIN_ANCHORS = 16
 
-# At most this share of the anchors (and at least MIN_GROWTH) is added at once.
+# At most this share of the anchors, or MIN_GROWTH if that is more, is added at once.
 MAX_GROWTH = 0.1
 MIN_GROWTH = 1_000
 
@@ -55,7 +54,7 @@ def grow(
 ) -> Growth:
     """Choose new anchors (Eq. 6 and the paragraph below it).
 
-    A child is a candidate on level i when drawn more than tau_obs times with mean gradient of at least
+    A child is a candidate on level i when drawn more than tau_obs times with a mean gradient of at least
     tau_g 2^i; 1 - 2^-(i+1) of them are kept at random. Cells shrink 4-fold per level down to `voxel_size`. Each
     free cell gets one anchor at its node with the element-wise maximum of the candidates' features, zero
     offsets and a scale of one cell. `logits` are the opacity logits of every slot at the mean direction.
@@ -87,7 +86,7 @@ def grow(
             0, member.unsqueeze(-1).expand(-1, features.shape[1]), scaffold.features.detach()[owners], "amax"
         )
         score = torch.zeros(count, dtype=torch.float64).scatter_reduce(0, member, mean[chosen], "amax")
-        # The parent is the candidate with the largest gradient in the cell (lowest slot on a tie).
+        # The parent is the candidate with the largest gradient in the cell, the lowest slot on a tie.
         parent = torch.full((count,), len(mean), dtype=torch.int64)
         best = mean[chosen] == score[member]
         parent = parent.scatter_reduce(0, member[best], chosen[best], "amin") // scaffold.slots
@@ -137,9 +136,9 @@ def new_anchor_opacity_offsets(
 
 
 def prune(scaffold: Scaffold, statistics: DensityStatistics, config: DensityConfig) -> Bool[Tensor, " anchor"]:
-    """True for every anchor to keep: those not yet seen often enough, or with some opacity to show."""
-    judged = statistics.visits > config.prune_min_views
-    faint = judged & (statistics.opacity < config.prune_opacity * statistics.visits)
+    """True for every anchor to keep: not visited often enough yet, or with a mean opacity above the threshold."""
+    visited = statistics.visits > config.prune_min_views
+    faint = visited & (statistics.opacity < config.prune_opacity * statistics.visits)
     keep = ~faint
     if int(keep.sum()) < min(MIN_ANCHORS, scaffold.count):
         return torch.ones_like(keep)
@@ -149,17 +148,17 @@ def prune(scaffold: Scaffold, statistics: DensityStatistics, config: DensityConf
 def thin_out(
     scaffold: Scaffold, statistics: DensityStatistics, most: int, generator: torch.Generator
 ) -> tuple[Bool[Tensor, " anchor"], Float[Tensor, " anchor"]]:
-    """Which `most` of more anchors stay, and what is added to the log-scale of each so that no gaps are left.
+    """Which `most` of more anchors stay, and what is added to the log-scale of each so that no gaps appear.
 
-    Half of those that stay are where the pictures ask for more; the others are drawn at random from all the rest, a
-    floor or a wall, and each takes the area of those that go beside it. Ours: the paper knows no budget.
+    Half of those that stay have the largest gradients; the others are a random sample of the rest (a floor or a wall)
+    and become larger by the area of those that are removed. Not in the paper, which has no budget.
     """
-    asked = (statistics.gradient / statistics.drawn.clamp_min(1)).amax(dim=-1)
-    order = torch.argsort(asked, descending=True, stable=True)
-    wanted, rest = order[: most // 2], order[most // 2 :]
-    stay = rest[torch.randperm(len(rest), generator=generator)[: most - len(wanted)]]
+    gradient = (statistics.gradient / statistics.drawn.clamp_min(1)).amax(dim=-1)
+    order = torch.argsort(gradient, descending=True, stable=True)
+    largest, rest = order[: most // 2], order[most // 2 :]
+    stay = rest[torch.randperm(len(rest), generator=generator)[: most - len(largest)]]
     keep = torch.zeros(scaffold.count, dtype=torch.bool)
-    keep[wanted] = True
+    keep[largest] = True
     keep[stay] = True
     wider = scaffold.log_scales.new_zeros(scaffold.count)
     wider[stay] = 0.5 * math.log(len(rest) / len(stay))  # they cover surfaces

@@ -10,10 +10,10 @@ from graings import constants
 
 
 class DensityStatistics:
-    """What was observed of each child, and of each anchor, since it was judged last; float64 sums and int64 counts.
+    """What was observed of each child and anchor since the last decision about it; float64 sums and int64 counts.
 
     `gradient` and `drawn` [A, k]: sum of NDC gradient norms and times drawn, per child. `opacity` and `visits`
-    [A]: sum over visits of the summed positive child scores, and times the anchor was in view or too faint to be drawn.
+    [A]: sum over visits of the summed positive child opacities, and visits: in view, or too faint to be drawn.
     """
 
     NAMES = ("gradient", "drawn", "opacity", "visits")
@@ -35,44 +35,44 @@ class DensityStatistics:
         """Record one view of a step.
 
         `children` are flat slots, `screen_gradient` is dL/d(mean in pixels), `visible` says which Gaussians
-        touched the image of `size` (width, height), `opacities` are the scores of every slot.
+        touched the image of `size` (width, height), `opacities` are those of every slot.
         """
         half = torch.tensor([size[0] / 2.0, size[1] / 2.0], dtype=torch.float64)
         norms = (screen_gradient.double() * half).norm(dim=-1)
         seen = children[visible]
         self.gradient.view(-1).index_add_(0, seen, norms[visible])
         self.drawn.view(-1).index_add_(0, seen, torch.ones_like(seen))
-        # An anchor without a drawn child is seen too: its opacity is what pruning wants to know.
+        # An anchor without a drawn child counts as visited too: pruning needs its opacity.
         visited = opacities.amax(dim=-1) <= constants.ALPHA_MIN
         visited[seen // opacities.shape[1]] = True
         self.visits += visited
         self.opacity += opacities.clamp_min(0).sum(-1).double() * visited
 
     def resize(self, keep: Bool[Tensor, " anchor"] | None = None, append: int = 0) -> None:
-        """Follow the scaffold: drop rows outside `keep`, then add `append` empty ones."""
+        """Follow the scaffold: remove rows outside `keep`, then append `append` empty ones."""
         for name in self.NAMES:
             rows: Tensor = getattr(self, name)
             if keep is not None:
                 rows = rows[keep]
             setattr(self, name, torch.cat([rows, rows.new_zeros((append, *rows.shape[1:]))]))
 
-    def forget_grown(self, min_observations: int) -> None:
-        """Start anew for children that were observed often enough to be judged."""
-        judged = self.drawn > min_observations
-        self.gradient[judged] = 0
-        self.drawn[judged] = 0
+    def reset_grown(self, min_observations: int) -> None:
+        """Reset children that were observed often enough for the growth that has just been decided."""
+        decided = self.drawn > min_observations
+        self.gradient[decided] = 0
+        self.drawn[decided] = 0
 
-    def forget_judged(self, visits: int) -> None:
-        """Start anew for anchors seen more than `visits` times: what one showed long ago does not say what it shows."""
-        judged = self.visits > visits
-        self.opacity[judged] = 0
-        self.visits[judged] = 0
+    def reset_pruned(self, visits: int) -> None:
+        """Reset anchors visited more than `visits` times: old opacities say nothing about the present one."""
+        decided = self.visits > visits
+        self.opacity[decided] = 0
+        self.visits[decided] = 0
 
     def state(self) -> dict[str, Tensor]:
         """Sums and counts by name."""
         return {name: getattr(self, name) for name in self.NAMES}
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `state()` gave."""
+        """Continue from what `state()` returned."""
         for name in self.NAMES:
             setattr(self, name, state[name].clone())

@@ -1,8 +1,8 @@
-"""Collapse: nothing of the scene is drawn any more, and what is not drawn gets no gradient to come back.
+"""Collapse: no Gaussian is drawn any more, and without being drawn none gets a gradient.
 
-Where the opacity of all children has fallen to one grey level or below, training would stand still for good. It is
-noticed after one pass over the training views and mended once, in the open; a second time the rates are to blame.
-Knows nothing of cameras or images.
+Where the opacity of all children has fallen to 1/255 or below, training would stop for good. This is detected after
+one pass over the training views; opacities are then raised once, with an event. A second collapse counts as divergence:
+the learning rates are too high.
 """
 
 from __future__ import annotations
@@ -16,65 +16,62 @@ from torch import Tensor, nn
 
 from graings.scene.scene import Scene
 
-# Below this share of the children in every step of a pass the scene has collapsed.
+# With less than this share of the children drawn in every step of a pass the scene has collapsed.
 MIN_DRAWN_FRACTION: Final = 1e-3
 
-# The score that the median child is given again: what children are born with.
+# Opacity that the median child gets: as at initialization.
 RESET_OPACITY: Final = 0.1
 
-# An empty picture that differs by up to this is about right: there is hardly anything to see.
+# Where an empty render has at most this photometric loss, the images are (nearly) empty themselves.
 MIN_LOSS: Final = 0.02
 
 
 class Collapse:
-    """What the steps of the current pass have shown, and whether a collapse was mended before.
+    """What was drawn in the current pass, and whether opacities were raised before.
 
-    Call `observe` for each step; after one that ended a pass in which nothing was shown, `missed` says whether there
-    was something to see.
+    Call `observe` after each step; after the step that ends a pass with a collapse, `missed` tells whether the images
+    were not empty.
     """
 
     def __init__(self) -> None:
         self.raised = False
         self.missed = False
-        self._shown = 0.0
+        self._drawn = 0.0
         self._difference = 0.0
 
     def observe(self, drawn: int, slots: int, difference: float, *, last_of_pass: bool) -> bool:
-        """Record a step that drew `drawn` of `slots` children; True when the pass it ends has shown a collapse.
+        """Record a step that drew `drawn` of `slots` children; True when it ends a pass with a collapse.
 
         `difference` is the largest photometric loss of its views.
         """
-        self._shown = max(self._shown, drawn / max(slots, 1))
-        if math.isfinite(difference):  # what is not is the guard's to judge
+        self._drawn = max(self._drawn, drawn / max(slots, 1))
+        if math.isfinite(difference):  # the guard handles what is not
             self._difference = max(self._difference, difference)
         if not last_of_pass:
             return False
-        collapsed, self.missed = self._shown < MIN_DRAWN_FRACTION, self._difference > MIN_LOSS
-        self._shown = self._difference = 0.0
+        collapsed, self.missed = self._drawn < MIN_DRAWN_FRACTION, self._difference > MIN_LOSS
+        self._drawn = self._difference = 0.0
         return collapsed
 
     def state(self) -> dict[str, Any]:
-        """Plain numbers to go on from."""
-        return {"mended": self.raised, "shown": self._shown, "loss": self._difference}
+        """Plain numbers to continue from."""
+        return {"raised": self.raised, "drawn": self._drawn, "loss": self._difference}
 
     def load(self, state: dict[str, Any]) -> None:
-        """Continue from what `state()` gave."""
-        self.raised, self._shown, self._difference = bool(state["mended"]), float(state["shown"]), float(state["loss"])
+        """Continue from what `state()` returned."""
+        self.raised, self._drawn, self._difference = bool(state["raised"]), float(state["drawn"]), float(state["loss"])
 
 
 def mean_logits(scene: Scene) -> Float[Tensor, "anchor child"]:
-    """Opacity logits of every slot as no particular camera sees it.
-
-    The mean direction stands for all views where opacity looks at it.
-    """
+    """Opacity logits of every slot for the mean viewing direction, if opacity depends on it."""
     with torch.no_grad():
-        still = torch.zeros_like(scene.scaffold.anchors)
-        logits = scene.appearance.opacity_logits(scene.scaffold.features, still)
+        mean_direction = torch.zeros_like(scene.scaffold.anchors)
+        logits = scene.appearance.opacity_logits(scene.scaffold.features, mean_direction)
         return logits + scene.scaffold.opacity_offsets.unsqueeze(-1)
 
 
 def raise_opacity(scene: Scene) -> float:
-    """Shift the last bias of the opacity head so that the median score is `RESET_OPACITY`; returns the shift."""
+    """Shift the last bias of the opacity head so that the median opacity is `RESET_OPACITY`; returns the shift."""
     shift = math.atanh(RESET_OPACITY) - float(mean_logits(scene).median())
     last = scene.appearance.opacity[-1]
     assert isinstance(last, nn.Linear)

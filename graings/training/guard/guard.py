@@ -1,8 +1,8 @@
-"""Guard: whether a step may reach the optimiser, and whether training has gone wrong.
+"""Guard: whether a step may reach the optimiser, and whether training has diverged.
 
-Bad gradients must be stopped before the optimiser: one spike of 1e3 times the usual size freezes its parameter
-for 20 000 steps of Adam. A bad step is skipped and recorded, an oversized one limited and recorded; nothing is ever
-repaired. The guard measures and counts, the trainer acts. Knows nothing of scenes, views or schedules.
+Bad gradients must be stopped before the optimiser: one spike of 1e3 times the usual size freezes its parameter for
+20 000 steps of Adam. A step with a NaN or infinity is skipped and recorded, one with far too large gradients is
+clipped and recorded; no value is ever repaired. The guard measures and counts, the trainer acts.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from torch import Tensor
 from graings.config import GuardConfig
 from graings.training.guard.loss_trend import LossTrend
 
-# One bad step can be a freak of a single view; three in a row mean the parameters themselves are lost.
+# One bad step can be due to a single view; three in a row mean that the parameters themselves are not finite.
 MAX_CONSECUTIVE_SKIPS: Final = 3
 
-# So do this many among the last MEMORY steps.
+# Skipped steps among the last MEMORY steps that count as divergence.
 MAX_RECENT_SKIPS: Final = 10
 MEMORY: Final = 1_000
 
-# The usual size of a group's gradient is the median over this many steps; with fewer than FEWEST there is none yet.
+# The usual norm of a group's gradient is the median over this many steps; it exists from MIN_NORMS steps on.
 WINDOW: Final = 200
-FEWEST: Final = 20
+MIN_NORMS: Final = 20
 
 
 class Gradient(NamedTuple):
-    """One gradient tensor; those of one `group` are limited together."""
+    """One gradient tensor; those of one `group` are clipped together."""
 
     name: str
     group: str
@@ -42,7 +42,7 @@ class Gradient(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StepCheck:
-    """On one step: the name of what is not finite in it, if anything, and groups that are far too large.
+    """Result of checking one step: what is not finite, if anything, and groups whose gradients are far too large.
 
     `limits` maps a group to (its norm, the norm it may have).
     """
@@ -52,9 +52,9 @@ class StepCheck:
 
 
 class Guard:
-    """Judges steps and remembers what it takes to judge the next ones.
+    """Checks steps and keeps the statistics that the next checks need.
 
-    `skipped`, `clipped` and `rollbacks` count what has happened in the whole run, also what a rollback undid.
+    `skipped`, `clipped` and `rollbacks` count events of the whole run, also those that a rollback undid.
     """
 
     def __init__(self, config: GuardConfig) -> None:
@@ -69,7 +69,7 @@ class Guard:
         self._last = ""
 
     def check_step(self, iteration: int, loss: Tensor, gradients: Sequence[Gradient]) -> StepCheck:
-        """Judge the step `iteration`, whose mean loss and gradients are given, before the optimiser sees it."""
+        """Check the step `iteration` from its mean loss and its gradients, before the optimiser is run."""
         norms = _norms(gradients)
         non_finite = None if bool(torch.isfinite(loss)) else "the loss"
         if non_finite is None:
@@ -88,7 +88,7 @@ class Guard:
         return StepCheck(None, limits)
 
     def problem(self) -> str | None:
-        """Why training cannot go on from here, or None."""
+        """Why training has to roll back, or None."""
         if self.consecutive >= MAX_CONSECUTIVE_SKIPS:
             return f"{self._last} was not finite in {self.consecutive} steps in a row"
         if len(self._recent) >= MAX_RECENT_SKIPS:
@@ -96,12 +96,12 @@ class Guard:
         return self.trend.problem()
 
     def rolled_back(self, before: Guard) -> None:
-        """This guard belongs to a restored moment; take over the counts of the guard that went wrong since."""
+        """This guard was restored from a snapshot; take over the counts of the guard `before` the rollback."""
         self.skipped, self.clipped, self.rollbacks = before.skipped, before.clipped, before.rollbacks
         self.consecutive, self._recent = 0, []
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Everything the next verdict depends on: norms by group, and plain numbers."""
+        """Everything the next check depends on: norms by group, and plain numbers."""
         tensors = {name: torch.tensor(list(norms), dtype=torch.float64) for name, norms in self._norms.items()}
         return tensors, {
             "skipped": self.skipped,
@@ -114,7 +114,7 @@ class Guard:
         }
 
     def load(self, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
-        """Continue from what `state()` gave."""
+        """Continue from what `state()` returned."""
         self._norms = {name: deque(norms.tolist(), maxlen=WINDOW) for name, norms in tensors.items()}
         self.skipped, self.clipped, self.rollbacks = facts["skipped"], facts["clipped"], facts["rollbacks"]
         self.consecutive, self._recent, self._last = facts["consecutive"], list(facts["recent"]), facts["last"]
@@ -128,9 +128,9 @@ class Guard:
         for group, parts in squares.items():
             norm = math.hypot(*parts)
             if norm == 0:
-                continue  # nothing drawn: says nothing about the usual size
+                continue  # nothing was drawn: no evidence of the usual norm
             seen = self._norms.setdefault(group, deque(maxlen=WINDOW))
-            if len(seen) >= FEWEST:
+            if len(seen) >= MIN_NORMS:
                 limit = self.config.clip * statistics.median(seen)
                 if norm > limit:
                     limits[group] = (norm, limit)
@@ -140,7 +140,7 @@ class Guard:
 
 
 def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
-    """Name of a tensor that holds a number that is none, or None."""
+    """Name of a tensor with a NaN or infinity, or None."""
     named = [Gradient(name, "", values) for name, values in tensors.items()]
     return next(
         (one.name for one, norm in zip(named, _norms(named), strict=True) if not math.isfinite(norm)),
@@ -149,7 +149,7 @@ def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
 
 
 def _norms(gradients: Sequence[Gradient]) -> list[float]:
-    """Euclidean norm of each tensor, not finite exactly where an entry is not."""
+    """Euclidean norm of each tensor; it is not finite exactly where an entry is not."""
     if not gradients:
         return []
     found: list[float] = torch.stack(list(torch._foreach_norm([one.values for one in gradients], 2))).tolist()

@@ -1,6 +1,6 @@
-"""Trend: the running mean of the loss against the best it has been.
+"""LossTrend: the running mean of the loss compared with its best value so far.
 
-Says when a run that still has finite numbers has come apart. Knows nothing of what the loss is made of.
+It detects divergence while all numbers are still finite.
 """
 
 from __future__ import annotations
@@ -9,22 +9,22 @@ from typing import Any, Final
 
 from graings.config import GuardConfig
 
-# Weight of the newest loss: single views differ by factors, fifty of them hardly do.
+# Weight of the newest loss in the running mean: losses of single views differ by factors, means of fifty hardly do.
 DECAY: Final = 0.02
 
-# So many losses are no mean yet.
+# Until so many losses the best value follows the mean: an easy first view would make all others look diverged.
 WARM_UP_STEPS: Final = 10
 
-# A loss this small may double without anybody seeing it.
+# A loss below this may double without a visible change.
 MARGIN: Final = 0.02
 
-# New anchors need a moment to find their place: this many steps after a growth do not count. The schedule
-# grows every 50 or 100 steps, so a longer pause would switch the detector off for most of a run.
+# New anchors raise the loss for some steps: this many after a growth do not count. The schedule grows every 50 or
+# 100 steps, so a longer pause would switch the detector off for most of a run.
 GROWTH_PAUSE: Final = 25
 
 
 class LossTrend:
-    """Mean and best mean of the losses so far, and for how many steps in a row the mean has been far above."""
+    """Running mean of the losses, its best value, and for how many steps in a row it has been far above that."""
 
     def __init__(self, config: GuardConfig) -> None:
         self._config = config
@@ -38,10 +38,9 @@ class LossTrend:
         """One more finite loss."""
         if self.mean is None:
             self.mean = self.best = loss
-        # A plain mean at first: the very first losses would otherwise weigh on it for a hundred steps.
+        # A plain mean at first: the first losses would otherwise dominate it for a hundred steps.
         self._count += 1
         self.mean += max(DECAY, 1.0 / self._count) * (loss - self.mean)
-        # An easy view at the start would make all others look like a relapse.
         self.best = self.mean if self._count <= WARM_UP_STEPS else min(self.best, self.mean)
         if self.mean <= self._limit():
             self.above = 0
@@ -50,26 +49,26 @@ class LossTrend:
         self._settling = max(0, self._settling - 1)
 
     def grown(self) -> None:
-        """The scene has just been given new anchors."""
+        """Anchors were just added."""
         self._settling = GROWTH_PAUSE
 
     def begin(self) -> None:
-        """From here on losses are of something else: those so far say nothing about them."""
+        """Start again: losses from here on (of another resolution) do not compare with those so far."""
         self.mean, self.best, self.above, self._count = None, 0.0, 0, 0
 
     @property
     def healthy(self) -> bool:
-        """Whether the mean is near the best, so that the moment is worth coming back to."""
+        """Whether the mean is near the best, so that the scene is worth a snapshot."""
         return self.mean is None or self.mean <= self._limit()
 
     def problem(self) -> str | None:
-        """Why the run has come apart, or None."""
+        """Why the run counts as diverged, or None."""
         if self.above < self._config.patience:
             return None
         return f"the mean loss was {self.mean:.3g} for {self.above} steps, after it had been {self.best:.3g}"
 
     def state(self) -> dict[str, Any]:
-        """Plain numbers to go on from."""
+        """Plain numbers to continue from."""
         return {
             "mean": self.mean,
             "best": self.best,
@@ -79,7 +78,7 @@ class LossTrend:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Continue from what `state()` gave."""
+        """Continue from what `state()` returned."""
         self.mean, self.best, self.above = state["mean"], state["best"], state["above"]
         self._count, self._settling = state["count"], state["settling"]
 

@@ -1,7 +1,4 @@
-"""Snapshots: the last good moments of a training, in memory, to go back to.
-
-Knows nothing of what makes a moment good.
-"""
+"""Snapshots: the last healthy states of a training, in memory, for rollbacks."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from torch import Tensor
 
 from graings.scene.scene import Scene
 
-# The newest may have been taken when things were going wrong unnoticed; the one before it was not.
+# The newest may have been taken when training was already diverging unnoticed; the one before it was not.
 KEPT: Final = 2
 
 
@@ -28,7 +25,7 @@ class Snapshot:
 
 
 class Snapshots:
-    """The last two snapshots. One that was gone back to in vain is given up for the one before it."""
+    """The last two snapshots. One from which training diverged again is dropped for the one before it."""
 
     def __init__(self) -> None:
         self._kept: list[Snapshot] = []
@@ -47,7 +44,7 @@ class Snapshots:
         self._tried = False
 
     def back(self) -> Snapshot:
-        """Where to go back to now. Raises `ValueError` when none was ever taken."""
+        """The snapshot to roll back to. Raises `ValueError` when none was taken."""
         if not self._kept:
             raise ValueError("no snapshot was taken")
         if self._tried and len(self._kept) > 1:
@@ -57,7 +54,7 @@ class Snapshots:
 
     @property
     def newest(self) -> Snapshot:
-        """The newest that is kept. Raises `ValueError` when there is none."""
+        """The newest snapshot. Raises `ValueError` when there is none."""
         if not self._kept:
             raise ValueError("no snapshot was taken")
         return self._kept[-1]

@@ -1,7 +1,8 @@
-"""Stiffness: whether the optimiser's steps fit the sizes of what they move, and how much is too small for any view.
+"""Stiffness: the length of the optimiser's steps relative to the Gaussians they move, and the share of Gaussians
+too small for any view.
 
-Steps longer than the Gaussians they move shake a scene instead of shaping it, and the scales of a Gaussian far smaller
-than a pixel get next to no gradient: the low-pass of the footprint hides them. Knows nothing of schedules or losses.
+Steps longer than the Gaussians they move make training oscillate. The scales of a Gaussian far smaller than a pixel
+get next to no gradient, because the low-pass filter dominates its footprint.
 """
 
 from __future__ import annotations
@@ -21,25 +22,26 @@ from graings.camera.camera import Camera
 from graings.capture.capture import Frame
 from graings.gaussians import Gaussians
 from graings.render import draw, low_pass
+from graings.report.events import Stiff
 from graings.scene.children import quaternion_product
-from graings.scene.scene import Scene
+from graings.scene.scene import Composition, Scene
 
 # Share of Gaussians whose step is no longer than `step_over_size` says.
 SHARE: Final = 0.99
 
-# Above this a step is longer than what it moves.
+# Above this a step is longer than the Gaussian it moves.
 STIFF: Final = 1.0
 
 # A footprint below this many px, both axes together, is too small for its scales to be learned.
 SUBPIXEL: Final = 0.1
 
-# Fainter Gaussians count as unseen: their footprint ends where it begins.
+# Below this opacity the footprint is too small to be measured: such Gaussians count as not seen.
 SEEN: Final = 2 * constants.ALPHA_MIN
 
 
 @dataclass(frozen=True, slots=True)
 class Stiffness:
-    """What one moment of training says: kappa_step and f_sub, None where nothing was measured or is drawn.
+    """kappa_step and f_sub at one iteration; None where nothing was measured or drawn.
 
     `views` is how many training views `subpixel_share` looked at.
     """
@@ -50,25 +52,22 @@ class Stiffness:
 
     @property
     def stiff(self) -> bool:
-        """Whether the last step that was measured was too long for the scene."""
+        """Whether the last measured step was longer than the Gaussians it moved."""
         return self.step_over_size is not None and self.step_over_size > STIFF
 
-    def events(self) -> tuple[str, ...]:
-        """What a user is told of a run that ended like this."""
-        if not self.stiff:
+    def events(self, iteration: int) -> tuple[Stiff, ...]:
+        """The event of a run that ended like this after `iteration`, if it was stiff."""
+        if self.step_over_size is None or not self.stiff:
             return ()
-        return (
-            f"stiff: the last steps still move the Gaussians by {self.step_over_size:.3g} times their own size "
-            "(99th percentile). Train longer, or with smaller last `rates` of offsets, deformation and matrices.",
-        )
+        return (Stiff(iteration=iteration, step_over_size=self.step_over_size),)
 
 
 def step_over_size(before: Gaussians, after: Gaussians, camera: Camera, blur: float) -> float | None:
-    """kappa_step: how far one step moved Gaussians over their own size in that direction, 99th percentile.
+    """kappa_step: how far one step moved Gaussians, over their size in that direction, 99th percentile.
 
-    The size is what `camera` can see of it, with the low-pass of the footprint (`blur`, px^2) at its distance: a disc
-    thinner than any pixel, moved by its own thickness, moves nothing. Of those drawn both times, known by their uids;
-    None where there are none, or where one of them is lost. Both are of the same instant.
+    The size includes the low-pass filter (`blur`, px^2) of `camera` at its distance: a disc much thinner than a pixel
+    that moves by its own thickness changes no pixel. Both sets are of the same time; Gaussians drawn in both, matched
+    by uid, count. None where there are none, or one is not finite.
     """
     uids = (before.uids.numpy(), after.uids.numpy())
     _, here, there = np.intersect1d(*uids, assume_unique=True, return_indices=True)
@@ -84,23 +83,39 @@ def step_over_size(before: Gaussians, after: Gaussians, camera: Camera, blur: fl
     return float(np.quantile(lengths.numpy(), SHARE)) if bool(lengths.isfinite().all()) else None
 
 
+class SubpixelCounter:
+    """f_sub: share of the Gaussians seen in a set of views whose footprint is below 0.1 px in all of them."""
+
+    def __init__(self, scene: Scene) -> None:
+        slots = scene.scaffold.count * scene.scaffold.slots
+        self._seen = torch.zeros(slots, dtype=torch.bool)
+        self._wide = torch.zeros(slots, dtype=torch.bool)
+        self.views = 0
+
+    @torch.no_grad()
+    def add(self, composition: Composition, radii: Float[Tensor, "gaussian 2"], camera: Camera) -> None:
+        """Count one view that was drawn with `radii`."""
+        gaussians = composition.gaussians
+        visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
+        self._seen[composition.children[visible]] = True
+        sizes = footprints(gaussians, radii, low_pass(composition, camera))
+        self._wide[composition.children[visible & (sizes >= SUBPIXEL)]] = True
+        self.views += 1
+
+    def share(self) -> float | None:
+        """The share over the views so far; None where no Gaussian was seen."""
+        count = int(self._seen.sum())
+        return int((self._seen & ~self._wide).sum()) / count if count else None
+
+
 @torch.no_grad()
 def subpixel_share(scene: Scene, frames: Sequence[Frame], background: Sequence[float]) -> float | None:
-    """f_sub: share of the Gaussians seen in `frames` whose footprint stays below a tenth of a pixel in all of them.
-
-    None where none is seen.
-    """
-    slots = scene.scaffold.count * scene.scaffold.slots
-    seen, wide = torch.zeros(slots, dtype=torch.bool), torch.zeros(slots, dtype=torch.bool)
+    """f_sub over the views `frames`, each drawn once."""
+    counter = SubpixelCounter(scene)
     for frame in frames:
         composition = scene.compose(frame.camera.center, frame.time)
-        gaussians, radii = composition.gaussians, draw(composition, frame.camera, background).radii
-        visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
-        seen[composition.children[visible]] = True
-        sizes = footprints(gaussians, radii, low_pass(composition, frame.camera))
-        wide[composition.children[visible & (sizes >= SUBPIXEL)]] = True
-    count = int(seen.sum())
-    return int((seen & ~wide).sum()) / count if count else None
+        counter.add(composition, draw(composition, frame.camera, background).radii, frame.camera)
+    return counter.share()
 
 
 def footprints(gaussians: Gaussians, radii: Float[Tensor, "gaussian 2"], blur: float) -> Float[Tensor, " gaussian"]:

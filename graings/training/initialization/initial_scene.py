@@ -1,8 +1,7 @@
-"""First anchors: from the capture's point cloud, or from random points that the masks allow (decision 3).
+"""The initial scene: anchors from the capture's point cloud, or from random points within the visual hull.
 
-Where the pictures show something everywhere, masks say nothing of where: places that pairs of pictures agree on, then.
-
-Knows nothing of networks' training; makes a scene that is ready for the first step.
+Where the masks cover nearly all of the images they do not constrain positions: points are then triangulated from pairs
+of images. The synthetic data sets of the paper have no point cloud, and it does not say what replaces one.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.random import RandomStreams
+from graings.report.events import PointsInitialized
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.training.curriculum.time_window import TimeWindow
@@ -28,28 +28,27 @@ from graings.training.density.budget import most_anchors
 from graings.training.density.growth import voxel_keys
 from graings.training.initialization.triangulation import triangulate
 from graings.training.initialization.visual_hull import (
-    MIN_CARVED,
     MIN_COVERAGE,
+    MIN_POINTS,
     MIN_VIEWS,
     WINDOW_FRACTIONS,
     MaskedFrame,
-    carve,
     check_not_empty,
     coverage,
     masked,
+    visual_hull,
 )
 
 FEATURE_STD = 0.1
 
-# The finest cell in pixels at the scene's centre, of views as fine as the reference: on D-NeRF 0.005 of its units at
-# 400 px, 0.0025 at 800.
+# Size of the finest voxel in pixels of the reference sampling rate: 0.005 units of D-NeRF at 400 px, 0.0025 at 800.
 VOXEL_PER_PIXEL = 0.7
 
-# Voting needs enough views to outvote a few wrong masks, not all of them.
+# Number of views that vote: enough to outvote a few wrong masks.
 CARVING_VIEWS = 60
 
-# Pictures that show something in more than this share of their pixels do not say where there is nothing. Objects on a
-# background take a third at most (bouncingballs), a room all but what has the background's colour.
+# Masks that cover more than this share of the pixels do not constrain positions. Objects on a background cover a third
+# at most (bouncingballs), a room nearly everything.
 FILLED = 0.7
 
 NEIGHBOURS = 3
@@ -62,16 +61,16 @@ class InitialScene:
     scene: Scene
     voxel_size: float  # normalised units
     time_window: float  # share of the clip that training begins with
-    notes: tuple[str, ...]  # what was decided on the way, in words
+    notes: tuple[PointsInitialized, ...]  # how the points were chosen, where masks did not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialPoints:
-    """Positions [M, 3] to start from, the `time_window` they stand for, and what was decided, in words."""
+    """Positions [M, 3] to start from, the `time_window` they stand for, and how they were chosen."""
 
     positions: NDArray[np.float64]
     time_window: float
-    notes: tuple[str, ...] = ()
+    notes: tuple[PointsInitialized, ...] = ()
 
 
 def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: RandomStreams) -> InitialScene:
@@ -81,7 +80,7 @@ def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, stream
     places = torch.from_numpy(first.positions)
     voxel = config.init.voxel_size or VOXEL_PER_PIXEL / SamplingRate.of(cameras, content_extent(places)).reference
     anchors = torch.unique(voxel_keys(places, voxel), dim=0).double() * voxel
-    extent = content_extent(anchors)  # where each place counts once, however many points a cloud has there
+    extent = content_extent(anchors)  # of anchors, not points: dense parts of a cloud must not dominate
     spacing = neighbour_distance(anchors.numpy()).clip(1e-4 * extent, 0.1 * extent)
     generator = streams["init"]
     count, scene = len(anchors), config.scene
@@ -108,64 +107,64 @@ def content_extent(points: Tensor) -> float:
 
 
 def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, streams: RandomStreams) -> InitialPoints:
-    """The capture's cloud, or else random points as far as the images allow them, or what pairs of images agree on.
+    """The capture's point cloud, or else random points within the visual hull, or points triangulated from the images.
 
-    The window is as configured, or else the widest in which the points still stand for what the images show.
+    The time window is as configured, or else the widest in which the points still cover the masks.
     """
     generator = streams["init.points"]
     window, most = config.time_window or 1.0, config.init.max_points
-    # What lies on surfaces stays: more of it than may grow would leave no room for what moves. Carved points lie inside
-    # of things, and most of them soon go.
-    lasting = min(most, most_anchors(config))
+    # Points on surfaces stay: more than the anchor budget would leave no room for growth. Points of a visual hull lie
+    # inside of objects, and most of them are soon pruned.
+    surface_limit = min(most, most_anchors(config))
     if capture.points is not None:
-        return InitialPoints(_subsampled(capture.points.positions, lasting, generator), window)
+        return InitialPoints(_subsampled(capture.points.positions, surface_limit, generator), window)
     half = content_half_size(capture)
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
     if config.init.min_mask_fraction == 0:
         return InitialPoints(_subsampled(cube, most, generator), window)
     order = torch.randperm(len(capture.train), generator=generator).tolist()
-    whole = _voters(capture, images, config, order, 1.0)
-    check_not_empty(whole)  # in a part of the clip all may be out of sight
-    notes: tuple[str, ...] = ()
+    whole = _masked_views(capture, images, config, order, 1.0)
+    check_not_empty(whole)  # within a part of the clip all objects may be out of view
+    notes: tuple[PointsInitialized, ...] = ()
     if np.mean([view.mask.mean() for view in whole]) > FILLED:
-        places, notes = _agreed(capture, images)
+        places, note = _triangulated(capture, images)
+        notes = (note,)
         if places is not None:
-            return InitialPoints(_subsampled(places, lasting, generator), window, notes)
-    carved, window = _carved(cube, order, whole, capture, images, config) or (cube, window)
-    return InitialPoints(_subsampled(carved, most, generator), window, notes)
+            return InitialPoints(_subsampled(places, surface_limit, generator), window, notes)
+    inside, window = _within_hull(cube, order, whole, capture, images, config) or (cube, window)
+    return InitialPoints(_subsampled(inside, most, generator), window, notes)
 
 
-def _agreed(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """What pairs of pictures agree on, None where that is too little; and what becomes of it, in words."""
+def _triangulated(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, PointsInitialized]:
+    """Points [M, 3] triangulated from pairs of images, None where there are too few; and the event for the report."""
     try:
         found = triangulate(capture.train, images)
     except ImportError:
-        hint = "pip install graings[colmap] takes them from what the pictures have in common"
-        return None, (f"first points: random, for the pictures are filled and there is no cloud; {hint}",)
-    count = len(found.places)
-    if count < MIN_CARVED:
-        return None, (f"first points: random, for pairs of pictures agree on {count} places only",)
-    said = f"first points: {count:,} places that pairs of pictures agree on, and {len(found.filled):,} between them"
-    return np.concatenate([found.places, found.filled]), (said,)
+        return None, PointsInitialized(iteration=0, source="random", triangulated=None)
+    count = len(found.points)
+    if count < MIN_POINTS:
+        return None, PointsInitialized(iteration=0, source="random", triangulated=count)
+    event = PointsInitialized(iteration=0, source="triangulation", triangulated=count, interpolated=len(found.filled))
+    return np.concatenate([found.points, found.filled]), event
 
 
-def _voters(
+def _masked_views(
     capture: Capture, images: ImageStore, config: TrainConfig, order: Sequence[int], share: float
 ) -> list[MaskedFrame]:
-    """What the first views in `order` show of those in the middle `share` of the clip."""
+    """Masks of the first views in `order` among those in the middle `share` of the clip."""
     window = TimeWindow(config, [frame.time for frame in capture.train], share)
     chosen = sorted([view for view in order if window.has(view, 0)][:CARVING_VIEWS])
     return masked([capture.train[view] for view in chosen], images, config.capture.background_rgb())
 
 
 def _subsampled(points: NDArray[np.float64], most: int, generator: torch.Generator) -> NDArray[np.float64]:
-    """At most `most` of `points` [M, 3], in their order."""
+    """At most `most` of `points` [M, 3], a random sample in their order."""
     if len(points) <= most:
         return points
     return points[np.sort(torch.randperm(len(points), generator=generator)[:most].numpy())]
 
 
-def _carved(
+def _within_hull(
     cube: NDArray[np.float64],
     order: Sequence[int],
     whole: Sequence[MaskedFrame],
@@ -173,19 +172,19 @@ def _carved(
     images: ImageStore,
     config: TrainConfig,
 ) -> tuple[NDArray[np.float64], float] | None:
-    """What the images leave of `cube`, the first views in `order` voting, and the share of the clip; None: nothing.
+    """The points of `cube` within the visual hull, and the share of the clip it is made of; None where none are left.
 
-    `whole` are the voters of all of the clip.
+    `whole` are the masks of views of the whole clip; for a part of it the first views in `order` are used.
     """
-    # A cell of a picture is a little less than the points' spacing as it appears there.
+    # A cell of an image is a little smaller than the projected spacing of the points.
     cells = math.ceil(1.25 * len(cube) ** (1 / 3))
     best, most = None, -1.0
     for share in WINDOW_FRACTIONS if config.time_window is None else [config.time_window]:
-        views = whole if share == 1 else _voters(capture, images, config, order, share)
+        views = whole if share == 1 else _masked_views(capture, images, config, order, share)
         if config.time_window is None and share < 1 and len(views) < MIN_VIEWS:
             break
-        kept = carve(cube, views, config.init.min_mask_fraction, cells)
-        if len(kept) < MIN_CARVED:
+        kept = visual_hull(cube, views, config.init.min_mask_fraction, cells)
+        if len(kept) < MIN_POINTS:
             continue
         covered = coverage(kept, views, cells)
         if covered > most:

@@ -1,7 +1,7 @@
-"""Carving: which random points the images allow, and in how much of the clip what they show stays in place.
+"""The visual hull: which random points lie within the masks, and for how long a part of the clip.
 
-A point is allowed that most views in which it lies show something at. Where things move far, no point is, for the whole
-clip taken as one instant; for a short part of it some are. Knows nothing of anchors, networks or random streams.
+A point is inside if it projects into the masks of most views that see it. With large motion no point is, if the whole
+clip is taken as one instant; within a short part of the clip some are.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.errors import CaptureError
 
-# Shares of the views that are asked for before the configured one: what stands still meets the first.
+# Mask fractions that are tried before the configured minimum: static objects reach the first.
 STRICTER_FRACTIONS: Final = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.65)
 
-# A mask is dilated by this many pixels, so that a thin moving part still counts as hit.
+# Masks are dilated by this many pixels, so that thin moving parts are not missed.
 MASK_MARGIN: Final = 2
 
-# With fewer points than this the vote has failed: no place shows something at most times.
-MIN_CARVED: Final = 100
+# With fewer points than this the visual hull has failed.
+MIN_POINTS: Final = 100
 
-# Points stand for what a picture shows in one piece where they lie within about one spacing of this share of it. Of the
-# clips looked at, those that train well as a whole have 0.74 and more, and two in which a ball is lost 0.42 and less.
+# Least share of each connected component of a mask that has to lie within about one spacing of a point. Of the tested
+# clips, those that train well as a whole have 0.74 and more, two in which a moving ball is missing 0.42 and less.
 MIN_COVERAGE: Final = 0.6
 
-# This share of the views may be worse: a few wrong masks, or things seen in passing.
+# This share of the views is ignored: a few wrong masks, or objects seen briefly.
 OUTLIER_FRACTION: Final = 0.05
 
-# Pieces of less than this share of what a picture shows are not worth a shorter part of the clip.
-SMALLEST_PIECE: Final = 0.01
+# Connected components below this share of the mask are ignored.
+MIN_COMPONENT: Final = 0.01
 
-# Shares of the clip that are tried, and the fewest views that may speak for one.
+# Shares of the clip that are tried, and the fewest views that each needs.
 WINDOW_FRACTIONS: Final = (1.0, 0.5, 0.25, 0.1)
 MIN_VIEWS: Final = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskedFrame:
-    """A frame, where it shows something, [H, W], and whether any of it is opaque, of whatever colour."""
+    """A frame, its mask [H, W] (opaque, and not of the background colour), and whether any pixel is opaque."""
 
     frame: Frame
     mask: NDArray[np.bool_]
@@ -54,7 +54,7 @@ class MaskedFrame:
 
 
 def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> list[MaskedFrame]:
-    """What each of `frames` shows: where it is opaque and not of the background's colour, which needs no Gaussians."""
+    """The masks of `frames`: opaque pixels that do not have the background colour."""
     found = []
     for frame in frames:
         alpha = images.alpha(frame)
@@ -68,94 +68,98 @@ def check_not_empty(views: Sequence[MaskedFrame]) -> None:
     """Raise `CaptureError` where all of `views` are transparent everywhere."""
     if not any(view.opaque for view in views):
         raise CaptureError(
-            "every mask is empty: there is nothing to see in any training image",
+            "every mask is empty: all training images are transparent",
             file=views[0].frame.name,
             field="alpha",
             remedy="Check the alpha channel of the images, or remove it.",
         )
 
 
-def carve(points: NDArray[np.float64], views: Sequence[MaskedFrame], vote: float, cells: int) -> NDArray[np.float64]:
-    """Those of `points` [M, 3] that the images allow, as few as show what the images do.
+def visual_hull(
+    points: NDArray[np.float64], views: Sequence[MaskedFrame], vote: float, cells: int
+) -> NDArray[np.float64]:
+    """Those of `points` [M, 3] within the visual hull, and as few as cover the masks.
 
-    Allowed is what lies on the dilated mask of at least a share `vote` of the views in which it lies. Where things move
-    that has to be a low one, and what stands still then has a fog about it, which most views see past: a plate seen
-    from above becomes two cones, base to base. So what nearly all views agree on comes first, and of what fewer do only
-    what `OUTLIER_FRACTION` of the views or more have no point for yet, in a picture whose longer side is `cells` long.
+    A point is inside if it projects into the dilated mask of at least a share `vote` of the views that see it. With
+    motion that share has to be low, and the hull of static objects is then too large: a plate seen from above becomes a
+    double cone. So points within nearly all masks come first, and points within fewer are added only where the masks of
+    `OUTLIER_FRACTION` of the views or more are not covered yet, in cells of which `cells` fit the longer image side.
     """
-    share = _votes(points, views)
+    share = _mask_fractions(points, views)
     points, share = points[share >= vote], share[share >= vote]
     seen = [_Cells.of(points, view, cells) for view in views]
     kept = share >= STRICTER_FRACTIONS[0]
     for least in (*[level for level in STRICTER_FRACTIONS[1:] if level > vote], vote):
         missed = np.zeros(len(points), np.int64)
         for view in seen:
-            missed += view.at(~view.near(kept) & (view.shown > 0))
+            missed += view.at(~view.near(kept) & (view.mask_pixels > 0))
         kept |= (share >= least) & (missed >= OUTLIER_FRACTION * len(views))
     few: NDArray[np.float64] = points[kept]
-    return few if len(few) >= MIN_CARVED else points
+    return few if len(few) >= MIN_POINTS else points
 
 
-def _votes(points: NDArray[np.float64], views: Sequence[MaskedFrame]) -> NDArray[np.float64]:
-    """Of the views in which each of `points` lies, the share on whose dilated mask it does."""
+def _mask_fractions(points: NDArray[np.float64], views: Sequence[MaskedFrame]) -> NDArray[np.float64]:
+    """For each point, the share of the views that see it in whose dilated mask it lies; -1 where no view does."""
     votes, seen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
         columns, rows, inside = _whole_pixels(points, view.frame.camera)
         mask = _dilated(view.mask, MASK_MARGIN)
         seen += inside
         votes[inside] += mask[rows[inside], columns[inside]]
-    # A point that no view sees is never allowed: nothing could train it.
     return np.where(seen > 0, votes / np.maximum(seen, 1), -1.0)
 
 
 def coverage(points: NDArray[np.float64], views: Sequence[MaskedFrame], cells: int) -> float:
-    """Share of its least covered piece that lies within a cell of a point, in all but a share
-    `OUTLIER_FRACTION` of `views`.
+    """Covered share of the least covered connected component of the masks, as a low quantile over `views`.
 
-    What hangs together in a picture is one piece: where a part of it has points the rest can grow, and a thing of its
-    own that has none is not found. `points` [M, 3] are in normalised units, and a picture's longer side is `cells`
-    long. 1 where no view shows anything.
+    A cell is covered if a point projects into it or a neighbour. A component without points is an object that growth
+    would not reach. `points` [M, 3] are in normalised units; `cells` fit the longer image side. 1 where all masks are
+    empty.
     """
     shares = []
     for view in views:
         if not view.mask.any():
             continue
         seen = _Cells.of(points, view, cells)
-        pieces = _pieces(seen.shown > 0).ravel()
-        whole = np.bincount(pieces, seen.shown.ravel())
-        covered = np.bincount(pieces, np.where(seen.near(np.ones(len(points), np.bool_)), seen.shown, 0).ravel())
-        counts = whole >= min(SMALLEST_PIECE * whole.sum(), whole.max())
+        components = _components(seen.mask_pixels > 0).ravel()
+        whole = np.bincount(components, seen.mask_pixels.ravel())
+        covered = np.bincount(
+            components, np.where(seen.near(np.ones(len(points), np.bool_)), seen.mask_pixels, 0).ravel()
+        )
+        counts = whole >= min(MIN_COMPONENT * whole.sum(), whole.max())
         shares.append(float((covered[counts] / whole[counts]).min()))
     return float(np.quantile(shares, OUTLIER_FRACTION)) if shares else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cells:
-    """A view in cells of several pixels: how many of each, [H, W], show something, and which cell each point is in."""
+    """A view in cells of several pixels: mask pixels per cell, [H, W], and the cell that each point projects into."""
 
-    shown: NDArray[np.int64]
-    cell: NDArray[np.int32]  # in rows, one after the other; of a point outside of the picture it says nothing
+    mask_pixels: NDArray[np.int64]
+    cell: NDArray[np.int32]  # row-major; meaningless for points outside the image
     inside: NDArray[np.bool_]
 
     @classmethod
     def of(cls, points: NDArray[np.float64], view: MaskedFrame, cells: int) -> _Cells:
-        """The picture's longer side is `cells` long."""
+        """With `cells` cells along the longer image side."""
         camera = view.frame.camera
         size = max(1, -(-max(camera.width, camera.height) // cells))
         columns, rows, inside = _whole_pixels(points, camera)
         down, across = np.arange(0, camera.height, size), np.arange(0, camera.width, size)
-        shown = np.add.reduceat(np.add.reduceat(view.mask, down, axis=0, dtype=np.int64), across, axis=1)
-        cell = (rows // size * len(across) + columns // size).astype(np.int32)  # many points, and as often as views
-        return cls(shown, cell, inside)
+        mask_pixels = np.add.reduceat(np.add.reduceat(view.mask, down, axis=0, dtype=np.int64), across, axis=1)
+        cell = (rows // size * len(across) + columns // size).astype(
+            np.int32
+        )  # 32 bit: there is one per point and view
+        return cls(mask_pixels, cell, inside)
 
     def near(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Cells, [H, W], that have one of the `chosen` points in them or next to them."""
-        near = np.zeros(self.shown.size, np.bool_)
+        """Cells, [H, W], with one of the `chosen` points in them or in a neighbour."""
+        near = np.zeros(self.mask_pixels.size, np.bool_)
         near[self.cell[self.inside & chosen]] = True
-        return _dilated(near.reshape(self.shown.shape), 1)
+        return _dilated(near.reshape(self.mask_pixels.shape), 1)
 
     def at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Points that are in one of the `cells`, [H, W]."""
+        """Points that project into one of the `cells`, [H, W]."""
         found: NDArray[np.bool_] = self.inside & cells.ravel()[self.cell]
         return found
 
@@ -180,11 +184,11 @@ def _dilated(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
     return grown
 
 
-def _pieces(grid: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """A number for each full cell of `grid` [H, W], one for all that touch by sides or corners; 0 for empty cells."""
+def _components(grid: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Connected components (8 neighbours) of `grid` [H, W]: a number per component, 0 for empty cells."""
     full = torch.from_numpy(grid).float()[None, None]
     numbers = torch.arange(1, grid.size + 1, dtype=torch.float32).reshape(full.shape) * full
     while not torch.equal(numbers, larger := torch.nn.functional.max_pool2d(numbers, 3, stride=1, padding=1) * full):
         numbers = larger
-    pieces: NDArray[np.int64] = numbers[0, 0].long().numpy()
-    return pieces
+    components: NDArray[np.int64] = numbers[0, 0].long().numpy()
+    return components

@@ -1,0 +1,56 @@
+"""HeldOut: one pass over views of a run, each drawn once: quality, rendering speed and footprints."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from numpy.typing import ArrayLike
+
+from graings.capture.capture import Frame
+from graings.capture.images import ImageStore
+from graings.evaluation.metrics import Lpips, SplitMetrics, measure_split
+from graings.render import picture
+from graings.scene.scene import Scene
+from graings.training.guard.stiffness import SubpixelCounter
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """What one pass over some views measured.
+
+    `frames_per_second` is the median over the views but the first, networks included, encoding not; `subpixel_share`
+    is f_sub of these views (`graings.training.guard.stiffness`).
+    """
+
+    metrics: SplitMetrics
+    frames_per_second: float
+    subpixel_share: float | None
+
+    @staticmethod
+    def measure(
+        scene: Scene,
+        frames: Sequence[Frame],
+        images: ImageStore,
+        background: Sequence[float],
+        lpips: Lpips | None = None,
+    ) -> HeldOut:
+        """Draw each of at least one view in `frames` once."""
+        footprints, seconds = SubpixelCounter(scene), list[float]()
+
+        def pairs() -> Iterator[tuple[str, float, ArrayLike, ArrayLike]]:
+            for frame in frames:
+                started = time.perf_counter()
+                with torch.inference_mode():
+                    composition = scene.compose(frame.camera.center, frame.time)
+                    result = picture(composition, frame.camera, background)
+                seconds.append(time.perf_counter() - started)
+                footprints.add(composition, result.radii, frame.camera)
+                yield frame.name, frame.time, result.color.clamp(0, 1).numpy(), images.rgb(frame)
+
+        metrics = measure_split(pairs(), lpips)
+        fps = 1.0 / max(statistics.median(seconds[1:] or seconds), 1e-9)
+        return HeldOut(metrics, fps, footprints.share())

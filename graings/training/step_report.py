@@ -1,0 +1,27 @@
+"""StepReport: what one step of training did and what it cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from graings.report.events import Event
+
+
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """One step.
+
+    `psnr` in dB is the mean over the training views of the step; `gaussians` is the number drawn in any of them.
+    `seconds` are wall time, `cpu_s` CPU time of all threads of the process.
+    """
+
+    iteration: int
+    iterations: int
+    phase: str
+    loss: float
+    psnr: float
+    gaussians: int
+    anchors: int
+    seconds: float
+    cpu_s: float
+    events: tuple[Event, ...] = ()

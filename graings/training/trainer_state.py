@@ -1,0 +1,190 @@
+"""TrainerState: everything that the next step of a training depends on, and its form in a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, TypeVar
+
+from torch import Tensor
+
+from graings.capture.capture import Capture
+from graings.capture.images import ImageStore
+from graings.config import TrainConfig
+from graings.config.schedule import Phase, phases
+from graings.random import RandomStreams
+from graings.report.events import PointsInitialized
+from graings.scene.scene import Scene
+from graings.training.curriculum.image_pyramid import ImagePyramid
+from graings.training.curriculum.time_window import TimeWindow
+from graings.training.density.control import DensityControl
+from graings.training.guard.collapse import Collapse
+from graings.training.guard.guard import Guard
+from graings.training.guard.snapshots import Snapshots
+from graings.training.initialization.initial_scene import make_scene
+from graings.training.objective import Objective
+from graings.training.optimizer import Optimizer
+from graings.training.parameter_average import ParameterAverage
+from graings.training.tensor_groups import joined, split
+from graings.training.view_batches import ViewBatches
+from graings.training.view_sampler import ViewSampler
+
+State = TypeVar("State", bound="TrainerState")
+
+# Factor on the learning rates after each rollback.
+RATE_CUT: Final = 0.5
+
+
+class TrainerState:
+    """A scene in training with its optimiser, random streams, schedules and guard.
+
+    Make it with `start` or `resume`. `iterations_before` are those of a run before a restart: reports count them,
+    `iteration` and the schedule of `config` do not. `time_window` is the share of the clip that training begins with,
+    `notes` are what initialization decided, for the first report.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        images: ImageStore,
+        config: TrainConfig,
+        scene: Scene,
+        *,
+        streams: RandomStreams,
+        voxel_size: float,
+        time_window: float,
+        notes: Sequence[PointsInitialized] = (),
+        iterations_before: int = 0,
+    ) -> None:
+        self.capture = capture
+        self.images = images
+        self.config = config
+        self.streams = streams
+        self.iterations_before = iterations_before
+        self.notes = tuple(notes)
+        self.iteration = 0
+        self.background = config.capture.background_rgb()
+        self.phases = phases(config)
+        self.objective = Objective(config, images, capture.times, streams)
+        self.window = TimeWindow(config, [frame.time for frame in capture.train], time_window)
+        self.snapshots = Snapshots()
+        self._attach(scene, voxel_size)
+
+    @classmethod
+    def start(
+        cls: type[State], capture: Capture, images: ImageStore, config: TrainConfig, iterations_before: int = 0
+    ) -> State:
+        """A trainer of a new scene. Raises `CaptureError` where no image shows anything."""
+        streams = RandomStreams(config.seed)
+        initial = make_scene(capture, images, config, streams)
+        return cls(
+            capture,
+            images,
+            config,
+            initial.scene,
+            streams=streams,
+            voxel_size=initial.voxel_size,
+            time_window=initial.time_window,
+            notes=initial.notes,
+            iterations_before=iterations_before,
+        )
+
+    @classmethod
+    def resume(
+        cls: type[State],
+        capture: Capture,
+        images: ImageStore,
+        config: TrainConfig,
+        scene: Scene,
+        tensors: dict[str, Tensor],
+        facts: dict[str, Any],
+        iterations_before: int = 0,
+    ) -> State:
+        """A trainer that continues from `scene` and what `state` returned with it."""
+        trainer = cls(
+            capture,
+            images,
+            config,
+            scene,
+            streams=RandomStreams(config.seed),
+            voxel_size=float(facts["voxel_size"]),
+            time_window=float(facts["time_window"]),
+            notes=[PointsInitialized.model_validate(note) for note in facts["notes"]],
+            iterations_before=iterations_before,
+        )
+        trainer.load(scene, tensors, facts)
+        return trainer
+
+    def _attach(self, scene: Scene, voxel_size: float) -> None:
+        """Everything whose shape follows the scene, and what watches over it."""
+        self.scene = scene
+        self.pyramid = ImagePyramid(self.config, self.capture.train, float(scene.extent))
+        views = min(self.config.batch, len(self.capture.train))
+        self.optimizer = Optimizer(scene, self.config, joint_from=self.phases[-1].first - 1, views=views)
+        self.density = DensityControl(self.config, scene, voxel_size)
+        self.guard = Guard(self.config.guard)
+        self.collapse = Collapse()
+        self.average = ParameterAverage()
+        self.step_over_size: float | None = None  # of the last step that was measured and not rolled back
+        self._restart_views()
+
+    def _restart_views(self) -> None:
+        """Views in a new order; after a rollback in another one, so that the failed step is not repeated."""
+        attempt = self.guard.rollbacks
+        stream = self.streams[f"sampler.{attempt}" if attempt else "sampler"]
+        sampler = ViewSampler(len(self.capture.train), stream)
+        self.views = ViewBatches(self.config.batch, self.window, self.pyramid, sampler)
+
+    @property
+    def run_iteration(self) -> int:
+        """Iterations of the run done, those before a restart included."""
+        return self.iterations_before + self.iteration
+
+    def phase(self, iteration: int) -> Phase:
+        """The phase that `iteration` (from 1) belongs to."""
+        return next(phase for phase in self.phases if iteration <= phase.last)
+
+    def _slow_down(self) -> None:
+        self.optimizer.damping = RATE_CUT**self.guard.rollbacks
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything beside the scene that the next step depends on: tensors and JSON."""
+        statistics, density = self.density.state()
+        means, average = self.average.state()
+        norms, guard = self.guard.state()
+        tensors = joined(
+            {
+                "adam": self.optimizer.state(),
+                "statistics": statistics,
+                "streams": self.streams.state(),
+                "sampler": {"remaining": self.views.sampler.remaining},
+                "average": means,
+                "guard": norms,
+            }
+        )
+        facts = {
+            "iteration": self.iteration,
+            "time_window": self.window.first,
+            "notes": [note.model_dump(mode="json") for note in self.notes],
+            **density,
+            "guard": guard,
+            "collapse": self.collapse.state(),
+            "average": average,
+            "step_over_size": self.step_over_size,
+        }
+        return tensors, facts
+
+    def load(self, scene: Scene, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
+        """Continue from a scene and what `state()` returned with it."""
+        self._attach(scene, float(facts["voxel_size"]))
+        parts = split(tensors, ("adam", "statistics", "streams", "sampler", "average", "guard"))
+        self.optimizer.load(parts["adam"])
+        self.density.load(parts["statistics"], facts)
+        self.streams.load(parts["streams"])
+        self.guard.load(parts["guard"], facts["guard"])
+        self.collapse.load(facts["collapse"])
+        self.average.load(parts["average"], facts["average"])
+        self.step_over_size = facts["step_over_size"]
+        self._slow_down()
+        self._restart_views()
+        self.views.sampler.remaining = parts["sampler"]["remaining"].clone()
+        self.iteration = int(facts["iteration"])
