@@ -2,10 +2,12 @@
 
     python benchmarks/raster_precision.py --yardstick DIR -o FOLDER [--gaussians 50000] [--size 400] [--rounds 9]
 
-DIR holds `bench_scene.py` (see rasterize.py); needs the extra `bench`. The reference is the kernel in float64 without
+DIR holds `bench_scene.py` (see rasterize.py). The reference is the kernel in float64 without
 cut-offs, itself checked against the torch oracle on a small scene. Writes FOLDER/raster_precision.json (schema
 graings.work_precision/1, kinds render and kernel) and FOLDER/raster_precision.svg: error against milliseconds of a
 frame, and against nanoseconds per pair of pixel and Gaussian, with the Pareto fronts; prints one line a point.
+
+    python benchmarks/raster_precision.py --redraw FILE.json        draws such a document again, as FILE.svg
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from typing import Any
 
 import scenes
 import torch
-from matplotlib import pyplot
+from matplotlib.figure import Figure
 from torch import Tensor
 from torch.nn import functional
 
@@ -31,6 +33,8 @@ from graings.kernel import use_threads
 from graings.raster import reference
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
+from graings.report.axes import line_style
+from graings.report.figure_files import INK, NOTE, style, svg
 from graings.report.machine import machine_facts, version_facts
 
 ALPHA_MINS = (1 / 64, 1 / 255, 1 / 512, 1 / 1024, 1 / 4096, 1e-6)
@@ -38,6 +42,7 @@ TRANSMITTANCES = (1e-2, 1e-3, 1e-4, 1e-6, 0.0)
 EXACT = RasterSettings(alpha_min=1e-9, transmittance_min=0.0)
 DEFAULT = RasterSettings()
 EXACTLY = 1e-17
+TICKS = (0.1, 0.2, 0.5, 1, 1.5, 2, 3, 5, 10, 20, 50, 100)
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,12 @@ class Point:
             "ms": {"median": self.ms, "min": self.ms_min},
             "err": {"rmse": self.rmse, "max": self.worst, "lsb8_changed": self.changed},
         }
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> Point:
+        setting, ms, error = values["setting"], values["ms"], values["err"]
+        errors = (error["rmse"], error["max"], error["lsb8_changed"])
+        return Point(setting["group"], setting["label"], ms["median"], ms["min"], *errors)
 
 
 def cast(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
@@ -138,50 +149,66 @@ def shown(rmse: float) -> float:
     return max(rmse, EXACTLY)
 
 
-def draw(axis: Any, points: list[Point], title: str, xlabel: str, scale: float) -> None:
-    for group in dict.fromkeys(point.group for point in points):
-        mine = [point for point in points if point.group == group]
-        line = axis.loglog(
-            [p.ms * scale for p in mine], [shown(p.rmse) for p in mine], marker="o", markersize=4, linewidth=1
-        )
-        line[0].set_label(group)
+@style()
+def precision_figure(document: dict[str, Any]) -> Figure:
+    """Error against milliseconds of a frame, and against nanoseconds per pair of pixel and Gaussian."""
+    scene, per_pair = document["scene"], "nanoseconds per pair of pixel and Gaussian that the default evaluates"
+    figure = Figure((14, 7.5), layout="constrained")
+    title = f"Error against time, {scene['gaussians']:,} Gaussians at {scene['size']} px"
+    figure.suptitle(title, color=INK, fontsize=12)
+    panels = (("render", "A frame", "milliseconds", 1.0), ("kernel", "The kernel", per_pair, 1e6 / scene["pairs"]))
+    places = figure.subplots(1, 2)
+    for axes, (kind, heading, label, scale) in zip(places, panels, strict=True):
+        draw(axes, [Point.from_json(values) for values in document[kind]["points"]], scale)
+        axes.set(title=heading, xlabel=label, ylabel=f"RMSE against float64 without cut-offs ({EXACTLY:.0e}: none)")
+    figure.draw_without_rendering()  # gives the axes their size, which the places of labels depend on
+    for axes, (kind, *_, scale) in zip(places, panels, strict=True):
+        name_points(axes, [Point.from_json(values) for values in document[kind]["points"]], scale)
+    return figure
+
+
+def draw(axes: Any, points: list[Point], scale: float) -> None:
+    """A line for each group of points, on logarithmic axes, and the Pareto front of all."""
+    for index, group in enumerate(dict.fromkeys(point.group for point in points)):
+        members = [point for point in points if point.group == group]
+        across, up = [point.ms * scale for point in members], [shown(point.rmse) for point in members]
+        axes.loglog(across, up, **line_style(index), linewidth=1, label=group)
     front = pareto(points)
-    axis.step(
-        [p.ms * scale for p in front],
-        [shown(p.rmse) for p in front],
-        where="post",
-        color="0.75",
-        linewidth=4,
-        zorder=0,
-        label="Pareto front",
-    )
-    axis.set(title=title, xlabel=xlabel, ylabel=f"RMSE against float64 without cut-offs ({EXACTLY:.0e}: none)")
-    axis.margins(0.2, 0.12)
-    axis.grid(True, which="major", color="0.92")
-    axis.legend(fontsize=8, frameon=False)
+    across, up = [point.ms * scale for point in front], [shown(point.rmse) for point in front]
+    axes.step(across, up, where="post", color="#d3d6d4", linewidth=4, zorder=0, label="Pareto front")
+    axes.margins(0.3, 0.14)
+    axes.yaxis.set_major_formatter("{x:.0e}")
+    low, high = axes.get_xlim()
+    ticks = [tick for tick in TICKS if low < tick < high]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.legend(loc="lower left")
 
 
-def label(axis: Any, points: list[Point], scale: float) -> None:
-    """Names the points once the axes have their size: those that lie on each other share a label, none covers one."""
-    places = axis.transData.transform([(p.ms * scale, shown(p.rmse)) for p in points])
-    clusters: list[tuple[Any, list[str]]] = []
+def name_points(axes: Any, points: list[Point], scale: float) -> None:
+    """Names above the points: those at the same place share a label, and no label covers another."""
+    places = axes.transData.transform([(p.ms * scale, shown(p.rmse)) for p in points])
+    clusters: list[tuple[Any, list[Point]]] = []
     for place, point in zip(places, points, strict=True):
-        near = next((names for other, names in clusters if abs(other - place).max() < 9), None)
-        name = f"{point.group} {point.label}"
+        near = next((members for centre, members in clusters if abs(centre - place).max() < 9), None)
         if near is None:
-            clusters.append((place, [name]))
-        elif name not in near:
-            near.append(name)
+            clusters.append((place, [point]))
+        else:
+            near.append(point)
     taken: list[tuple[float, float, float]] = []
-    for (x, y), names in sorted(clusters, key=lambda cluster: float(cluster[0][1])):
+    for (x, y), members in sorted(clusters, key=lambda cluster: float(cluster[0][1])):
+        # The colour tells the group of a single point.
+        names = [p.label if len(members) == 1 or p.group == p.label else f"{p.group} {p.label}" for p in members]
         text = ", ".join(names if len(names) < 4 else [*names[:2], f"{len(names) - 2} more"])
-        low, width = y + 5, 4.4 * len(text)
-        while any(abs(low - other) < 10 and x < right and left < x + width for left, other, right in taken):
-            low += 10
+        low, width = y + 5, 6.0 * len(text)
+        while any(abs(low - height) < 12 and x < right and left < x + width for left, height, right in taken):
+            low += 12
         taken.append((x, low, x + width))
-        note = axis.annotate(
-            text, axis.transData.inverted().transform((x, y)), xytext=(4, (low - y) * 0.72), textcoords="offset points",
-            fontsize=6.5, color="0.3", arrowprops={"arrowstyle": "-", "color": "0.8", "linewidth": 0.5},
+        points_per_pixel = 72 / axes.get_figure().dpi
+        note = axes.annotate(
+            text, axes.transData.inverted().transform((x, y)), xytext=(4, (low - y) * points_per_pixel),
+            textcoords="offset points", fontsize=7, color=NOTE,
+            arrowprops={"arrowstyle": "-", "color": "0.8", "linewidth": 0.5},
         )  # fmt: skip
         note.set_in_layout(False)
 
@@ -193,12 +220,18 @@ def _part(kind: str, points: list[Point]) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--yardstick", type=Path, required=True)
-    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--yardstick", type=Path)
+    parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--redraw", type=Path)
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--size", type=int, default=400)
     parser.add_argument("--rounds", type=int, default=9)
     options = parser.parse_args()
+    if options.redraw is not None:
+        options.redraw.with_suffix(".svg").write_text(svg(precision_figure(json.loads(options.redraw.read_text()))))
+        return
+    if options.yardstick is None or options.output is None:
+        parser.error("give --yardstick DIR and -o FOLDER, or --redraw FILE.json")
     generator = scenes.module_of(options.yardstick, "bench_scene")
     if generator is None:
         parser.error(f"{options.yardstick / 'bench_scene.py'} not found: give its folder with --yardstick")
@@ -232,21 +265,6 @@ def main() -> None:
             f"{point.group:<22} {point.label:<14} {point.ms:8.2f} ms  rmse {point.rmse:.2e}  max {point.worst:.2e}  "
             f"8-bit changed {point.changed:.2%}"
         )
-    figure, axes = pyplot.subplots(1, 2, figsize=(16, 8), layout="constrained")
-    draw(axes[0], render, "A frame", "milliseconds", 1.0)
-    draw(
-        axes[1],
-        variants,
-        "The kernel",
-        "nanoseconds per pair of pixel and Gaussian that the default evaluates",
-        1e6 / bench.pairs,
-    )
-    figure.canvas.draw()
-    label(axes[0], render, 1.0)
-    label(axes[1], variants, 1e6 / bench.pairs)
-    figure.suptitle(f"Error against time, {options.gaussians:,} Gaussians at {options.size} px")
-    options.output.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.output / "raster_precision.svg")
     document = {
         "schema": "graings.work_precision/1",
         "machine": machine_facts().to_json(),
@@ -257,6 +275,8 @@ def main() -> None:
         "kernel": _part("kernel", variants),
         "omissions": ["variants of the exponential and of the backward pass: the kernel has one of each"],
     }
+    options.output.mkdir(parents=True, exist_ok=True)
+    (options.output / "raster_precision.svg").write_text(svg(precision_figure(document)))
     (options.output / "raster_precision.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 

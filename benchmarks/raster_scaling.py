@@ -1,6 +1,6 @@
 """How the rasterizer's time grows: against Gaussians, against pixels, against threads, stage by stage.
 
-    python benchmarks/raster_scaling.py --yardstick DIR -o FOLDER [--rounds 11]        (needs the extra `bench`)
+    python benchmarks/raster_scaling.py --yardstick DIR -o FOLDER [--rounds 11]
 
 DIR holds `bench_scene.py` (see rasterize.py). Writes FOLDER/raster_scaling.{json,svg} and prints, for every stage, the
 slope of log time against log size: 1 is linear, 0 does not grow. Medians of wall-clock milliseconds of one forward +
@@ -10,16 +10,14 @@ backward.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 from pathlib import Path
 from typing import Any
 
 import scenes
 import torch
-from matplotlib import pyplot
 from rasterize import Ours
-from scaling import show
+from scaling import write_scaling
 
 from graings import kernel
 from graings.kernel import use_threads
@@ -59,19 +57,13 @@ def main() -> None:
         "pixels, with 50 000 Gaussians": {size * size: measure(50_000, size, cores) for size in SIZES},
         "threads, 200 000 Gaussians at 800 px": {n: measure(200_000, 800, n) for n in range(1, cores + 1)},
     }
-    figure, axes = pyplot.subplots(1, len(series), figsize=(15, 4.5), layout="constrained", sharey=True)
-    for axis, (title, rows) in zip(axes, series.items(), strict=True):
-        show(axis, title, rows, "stage")
-    axes[0].set_ylabel("milliseconds")
-    figure.suptitle(f"What one forward + backward of the rasterizer costs ({kernel.active_isa()}, {cores} threads)")
-    options.output.mkdir(parents=True, exist_ok=True)
     document = {
+        "title": "What one forward + backward of the rasterizer costs",
         "isa": kernel.active_isa(),
         "threads": cores,
         "series": {title: {str(x): row for x, row in rows.items()} for title, rows in series.items()},
     }
-    (options.output / "raster_scaling.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
-    figure.savefig(options.output / "raster_scaling.svg")
+    write_scaling(options.output, "raster_scaling", document)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How a training step's time grows: against Gaussians at one image size, against pixels at one scene.
 
-    python benchmarks/step_scaling.py RUN -o FOLDER [--threads 2] [--steps 40]        (needs the extra `bench`)
+    python benchmarks/step_scaling.py RUN -o FOLDER [--threads 2] [--steps 40]
 
 Continues RUN (a folder with a checkpoint) in memory; nothing in it is written. Fewer Gaussians are a random share of
 its anchors, other sizes the same capture read anew, so the largest useful size is that of its files. Writes
@@ -11,13 +11,11 @@ does not grow. A step has as many views as the run says. The parts are those of 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 from pathlib import Path
 
 import torch
-from matplotlib import pyplot
-from scaling import show
+from scaling import write_scaling
 from training_step import Stopwatch, measured_step
 
 from graings import kernel
@@ -72,24 +70,16 @@ def main() -> None:
         trainer = trainer_of(options, 1.0, side)
         camera = trainer.capture.train[0].camera
         by_pixels[camera.width * camera.height] = milliseconds(trainer, options.steps)[1]
-    series = {"Gaussians drawn": by_count, "pixels of an image": by_pixels}
-    figure, axes = pyplot.subplots(1, 2, figsize=(11, 4.8), layout="constrained", sharey=True)
-    for axis, (title, rows) in zip(axes, series.items(), strict=True):
-        show(axis, title, rows, "part")
-    axes[0].set_ylabel("milliseconds")
     views = trainer.config.batch
-    figure.suptitle(
-        f"What one training step of {views} views costs ({kernel.active_isa()}, {kernel.thread_count()} threads)"
-    )
-    options.output.mkdir(parents=True, exist_ok=True)
+    series = {"Gaussians drawn": by_count, "pixels of an image": by_pixels}
     document = {
+        "title": f"What one training step of {views} views costs",
         "isa": kernel.active_isa(),
         "threads": kernel.thread_count(),
         "views": views,
         "series": {title: {str(size): row for size, row in rows.items()} for title, rows in series.items()},
     }
-    (options.output / "step_scaling.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
-    figure.savefig(options.output / "step_scaling.svg")
+    write_scaling(options.output, "step_scaling", document)
 
 
 if __name__ == "__main__":

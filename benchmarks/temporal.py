@@ -1,6 +1,6 @@
 """How a model behaves in time: flicker where nothing moves, and error between the times it was trained on.
 
-    python benchmarks/temporal.py RUN... -o FOLDER [--frames 100] [--view 0]        (needs the extra `bench`)
+    python benchmarks/temporal.py RUN... -o FOLDER [--frames 100] [--view 0]
 
 Flicker: one held-out camera stands still while time runs through [0, 1]. A pixel rests where the figure covers it at
 every time and the mean over five frames around each stays within 4 levels of 255; what the frames differ from that mean

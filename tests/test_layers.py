@@ -85,11 +85,11 @@ HOMES: dict[str, tuple[str, ...]] = {
     "OpenImageIO": ("graings.capture", "graings.image_encoding"),
     "pycolmap": ("graings.capture", "graings.training.initialization"),
     "lpips": ("graings.evaluation.metrics",),
-    "matplotlib": ("graings.report.picture",),
+    "matplotlib": ("graings.report", "graings.ablation.plot"),
     "safetensors": ("graings.storage.checkpoint", "graings.storage.compact"),
 }
 
-# Optional extras: heavy, or absent from most machines.
+# Optional extras, and what takes long to import and is not always used.
 MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "matplotlib"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}

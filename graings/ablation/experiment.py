@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from graings.ablation.plot import differences_svg
+from graings.ablation.plot import differences_figure
 from graings.ablation.rows import ROWS, Row, chosen_rows, combined, nothing_to_compare, row_config
 from graings.ablation.table import TABLE_FILE, AblationCapture, AblationTable, make_table, markdown
 from graings.capture.capture import Capture
@@ -19,8 +19,8 @@ from graings.capture.load import load_capture
 from graings.config import TrainConfig, make_config
 from graings.document import read_document
 from graings.errors import CaptureError, CheckpointError, ConfigError
+from graings.report.figure_files import png, svg
 from graings.report.metrics_document import METRICS_FILE, Metrics, read_metrics
-from graings.report.picture import missing_reason, png
 from graings.report.run_record import RunRecord
 from graings.storage.files import write_bytes, write_document, write_text
 from graings.storage.run_folder import RECORD_FILE
@@ -110,16 +110,15 @@ class Ablation:
             self.write()
 
     def write(self) -> AblationTable:
-        """Write ablation.json, .md, .svg and, with matplotlib, .png from all finished runs; returns the first."""
+        """Write ablation.json, .md, .svg and .png from all finished runs; returns the first."""
         self.folder.mkdir(parents=True, exist_ok=True)
         rows = [(row, {seed: self._metrics(row, seed) for seed in self._shown_seeds}) for row in self._shown_rows]
         table = make_table(self._capture_facts(), self._options, self._changed, self._shown_seeds, rows)
         write_document(self.folder / TABLE_FILE, table)
         write_text(self.folder / "ablation.md", markdown(table))
-        drawing = differences_svg(table.model_dump(mode="json"))
-        write_text(self.folder / "ablation.svg", drawing)
-        if missing_reason() is None:
-            write_bytes(self.folder / "ablation.png", png(drawing))
+        figure = differences_figure(table.model_dump(mode="json"))
+        write_text(self.folder / "ablation.svg", svg(figure))
+        write_bytes(self.folder / "ablation.png", png(figure))
         return table
 
     def _capture_facts(self) -> AblationCapture:

@@ -16,13 +16,13 @@ from pathlib import Path
 
 from graings.config import TrainConfig
 from graings.errors import CheckpointError
+from graings.report.figure_files import png, svg
 from graings.report.metrics_document import Metrics
-from graings.report.picture import missing_reason, png
-from graings.report.plots import training_svg
-from graings.report.render_plot import render_svg
+from graings.report.render_plot import render_figure
 from graings.report.render_precision import BUDGET_S, render_part
 from graings.report.run_record import read_record
 from graings.report.tables import tables
+from graings.report.training_plot import training_figure
 from graings.report.work_precision import read_run, run_names, training_part
 from graings.report.work_precision_document import REPORT_FILE, TrainingPart, WorkPrecision
 from graings.storage.compact import open_model
@@ -46,8 +46,8 @@ def report_runs(
     """Write the report of `runs`, folders of runs or their `metrics.json`, to `folder`, figures as SVG and PNG.
 
     With `render` the model of every run is rendered and timed for about `budget_s` seconds, with the threads of this
-    process. A run without a model, and PNG without matplotlib, are left out with a note. Raises `CheckpointError`
-    naming a run whose metrics cannot be read, `ValueError` when one is given twice.
+    process. A run without a model is left out with a note. Raises `CheckpointError` naming a run whose metrics cannot
+    be read, `ValueError` when one is given twice.
     """
     names = run_names(runs)
     training = [_training(name, path) for name, path in zip(names, runs, strict=True)]
@@ -84,22 +84,19 @@ def _folder(path: Path) -> Path:
 
 def _write(folder: Path, report: WorkPrecision, *, with_png: bool) -> WrittenReport:
     folder.mkdir(parents=True, exist_ok=True)
-    drawings = {"training": training_svg([part.model_dump(mode="json") for part in report.training])}
+    figures = {"training": training_figure([part.model_dump(mode="json") for part in report.training])}
     if report.render:
-        drawings["render"] = render_svg([part.model_dump(mode="json") for part in report.render])
-    texts = tables(report) | {f"{name}.svg": drawing for name, drawing in drawings.items()}
+        figures["render"] = render_figure([part.model_dump(mode="json") for part in report.render])
+    texts = tables(report) | {f"{name}.svg": svg(figure) for name, figure in figures.items()}
     # A file that only an earlier report had would contradict this one.
     for stale in {"render.csv", "render.svg", "render.png", "training.png"} - texts.keys():
         (folder / stale).unlink(missing_ok=True)
     write_document(folder / REPORT_FILE, report)
     for name, text in texts.items():
         write_text(folder / name, text)
-    files, notes = [REPORT_FILE, *texts], list(report.omissions)
-    reason = missing_reason() if with_png else None
-    if reason is not None:
-        notes.append(f"PNG left out: {reason}")
-    elif with_png:
-        for name, drawing in drawings.items():
-            write_bytes(folder / f"{name}.png", png(drawing))
+    files = [REPORT_FILE, *texts]
+    if with_png:
+        for name, figure in figures.items():
+            write_bytes(folder / f"{name}.png", png(figure))
             files.append(f"{name}.png")
-    return WrittenReport(folder, tuple(files), report, tuple(notes))
+    return WrittenReport(folder, tuple(files), report, report.omissions)

@@ -17,5 +17,8 @@ def error(value: float) -> str:
 
 
 def count(number: float) -> str:
-    """A count, thousands as k."""
-    return f"{number:.3g}" if number < 1000 else f"{number / 1000:.3g}k"
+    """A count, thousands as k and millions as M."""
+    for size, unit in ((1e6, "M"), (1e3, "k")):
+        if number >= size:
+            return f"{number / size:.3g}{unit}"
+    return f"{number:.3g}"

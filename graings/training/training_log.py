@@ -16,7 +16,9 @@ from graings.config import TrainConfig
 from graings.document import Document
 from graings.evaluation.metrics import SplitMetrics
 from graings.plan.plan import Plan
+from graings.report.curve import curve_figure
 from graings.report.events import Event
+from graings.report.figure_files import svg
 from graings.report.folder import report_training
 from graings.report.machine import machine_facts, version_facts
 from graings.report.metrics_document import (
@@ -30,7 +32,6 @@ from graings.report.metrics_document import (
     StiffnessFacts,
     config_hash,
 )
-from graings.report.report import curve_svg
 from graings.report.run_record import CaptureSource, RunRecord
 from graings.report.work_precision import run_names
 from graings.scene.scene import Scene
@@ -181,7 +182,9 @@ class TrainingLog:
             hashes=Hashes(config=config_hash(self.config), capture=self.capture.content_hash),
         )
         write_document(self.folder / METRICS_FILE, metrics)
-        write_text(self.folder / "curve.svg", curve_svg([point.model_dump(mode="json") for point in self.curve]))
+        write_text(
+            self.folder / "curve.svg", svg(curve_figure([point.model_dump(mode="json") for point in self.curve]))
+        )
         report_training(run_names([self.folder])[0], metrics, self.config, self.folder / "report")
         self.clock.add("report", time.perf_counter() - started)
 

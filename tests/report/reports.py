@@ -1,9 +1,8 @@
-"""Hand-made metrics of runs that nobody trained, and the words of a drawing."""
+"""Hand-made metrics of runs, without training."""
 
 from __future__ import annotations
 
 import json
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,6 @@ from graings.report.metrics_document import EvaluationPoint, Metrics
 from graings.report.work_precision import training_part
 from graings.report.work_precision_document import TrainingPart
 from graings.storage.files import write_document
-
-SVG = "{http://www.w3.org/2000/svg}"
 
 VIEW = {"time": 0.5, "psnr": 30.0, "ssim_3dgs": 0.9, "lpips_vgg": None, "mse": 1e-3}
 
@@ -109,14 +106,3 @@ def write_run(folder: Path, document: Metrics | dict[str, Any]) -> Path:
     else:
         (folder / "metrics.json").write_text(json.dumps(document))
     return folder
-
-
-def elements(svg: str, tag: str, kind: str = "") -> list[ElementTree.Element]:
-    """Elements of a drawing whose classes contain `kind`."""
-    found = ElementTree.fromstring(svg).iter(f"{SVG}{tag}")
-    return [element for element in found if not kind or kind in element.attrib.get("class", "").split()]
-
-
-def words(svg: str) -> list[str]:
-    """All texts of a drawing."""
-    return [element.text or "" for element in elements(svg, "text")]

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +85,6 @@ def test_a_small_budget_draws_fewer_views_but_every_setting(model: Model) -> Non
 
 
 def test_a_report_of_several_runs_is_complete(run: Path, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="PNG needs the extra plot")
     bare = write_run(tmp_path / "bare", metrics(*CURVE))
     written = report_runs([run, bare], tmp_path / "report", budget_s=0.1)
     assert sorted(path.name for path in (tmp_path / "report").iterdir()) == sorted(written.files)
@@ -103,18 +101,6 @@ def test_a_report_written_again_keeps_nothing_that_contradicts_it(run: Path, tmp
     report_runs([run], tmp_path, render=False)
     assert not list(tmp_path.glob("render.*"))
     assert read(tmp_path)["render"] == []
-
-
-def test_without_matplotlib_the_rest_is_written_and_the_extra_is_named(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(SystemExit) as ending:
-        main(["report", str(run), "-o", str(tmp_path), "--no-render", "--threads", "1"])
-    assert ending.value.code == 0
-    assert "PNG left out: matplotlib is not installed (pip install 'graings[plot]')" in capsys.readouterr().out
-    assert (tmp_path / "training.svg").exists()
-    assert not list(tmp_path.glob("*.png"))
 
 
 def test_a_run_in_the_middle_of_its_training_has_a_report_too(tmp_path: Path) -> None:
