@@ -51,7 +51,7 @@ def open_context(settings: Settings) -> Context:
     discard_leftovers(store.uploads)
     engine = Engine(settings.database_url)
     jobs = JobQueue(store, engine)
-    jobs.enqueue_orphans()
+    jobs.enqueue_stored_jobs()
     return Context(
         settings=settings,
         store=store,

@@ -61,7 +61,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.render", "graings.report", "graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
-    "jobs": ("graings.config", "graings.storage.run_folder"),
+    "jobs": ("graings.config", "graings.storage.files", "graings.storage.run_folder"),
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
     # HTTP never trains.
     "service": (

@@ -26,7 +26,7 @@ def test_health_and_readiness(client: TestClient, job: str, settings: Settings) 
     found = client.get("/readyz").json()
     assert (found["ready"], found["workers"], found["waiting"]) == (True, 0, 1)
     leases = FileLeases(Store(settings.data).workers)
-    assert leases.take("worker-a")
+    assert leases.acquire("worker-a")
     assert client.get("/readyz").json()["workers"] == 1
     leases.close()
 
