@@ -149,7 +149,7 @@ class Store:
             if _files(capture) == _files(unpacked):
                 shutil.rmtree(unpacked)
             else:
-                # A new capture, or one of whose files some are missing: replace it with the complete upload.
+                # A new capture, or one with missing files: replace it with the complete upload.
                 if capture.exists():
                     capture.rename(self.uploads / f"{job_id}.replaced")
                 unpacked.rename(capture)

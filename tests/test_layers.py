@@ -76,6 +76,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),
+    "werkzeug": ("service.routes.render",),
     "typer": ("graings.cli.main", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
     "rich": (
         *("graings.cli.main", "graings.cli.training", "graings.cli.progress", "graings.cli.terminal", "jobs.commands"),
