@@ -1,4 +1,4 @@
-"""The command `worker`; also `python -m jobs.commands`. Knows nothing of how jobs are done."""
+"""The command `worker`; also `python -m jobs.commands`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DATABASE_FILE = "jobs.sqlite"
 
 
 def default_database(data: Path) -> str:
-    """The SQLite database in the data folder; it must lie on a local disk."""
+    """The URL of the SQLite database in the data folder, which must be on a local disk."""
     return f"sqlite:///{data.resolve() / DATABASE_FILE}"
 
 
@@ -34,14 +34,16 @@ def worker(
         ),
     ] = None,
     slots: Annotated[
-        int, typer.Option(min=1, max=64, help="Jobs at a time; the worker started last decides for all.")
+        int, typer.Option(min=1, max=64, help="Jobs at a time; the last worker to start sets it for all workers.")
     ] = 1,
     threads: Annotated[
-        int | None, typer.Option(min=1, max=256, help="CPU threads per job (default: all / slots).")
+        int | None, typer.Option(min=1, max=256, help="CPU threads per job (default: all cores / slots).")
     ] = None,
-    exit_with_parent: Annotated[bool, typer.Option("--exit-with-parent", help="End when standard input ends.")] = False,
+    exit_with_parent: Annotated[
+        bool, typer.Option("--exit-with-parent", help="Stop when standard input ends.")
+    ] = False,
 ) -> None:
-    """Take training jobs from the queue until interrupted. Running jobs are brought to a checkpoint then."""
+    """Take training jobs from the queue until interrupted, then stop the running jobs at a checkpoint."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -49,9 +51,11 @@ def worker(
     if exit_with_parent:
         watch_parent(stop.set)
     store = Store(data)
-    chosen = threads or max(1, len(os.sched_getaffinity(0)) // slots)
+    # macOS cannot limit a process to some cores.
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    job_threads = threads or max(1, cores // slots)
     try:
-        Worker(store, database or default_database(store.root), slots=slots, threads=chosen).run(stop)
+        Worker(store, database or default_database(store.root), slots=slots, threads=job_threads).run(stop)
     except JobError as error:
         typer.echo(f"worker: {error}", err=True)
         raise typer.Exit(1) from error

@@ -1,52 +1,37 @@
-"""Engine: the durable queue. The only module that knows DBOS.
+"""Engine: the durable queue of jobs, and the only module that uses DBOS.
 
-`Engine` is what everybody may ask of the queue, from any process; `executing` makes this process one that takes jobs
-from it. SQLite or PostgreSQL by URL, with the same meaning. A job's state here is where it is in the queue; how far it
-got is on disk.
+`Engine` reads and changes the queue from any process; `executing` makes this process a worker that takes jobs from it.
+The database is SQLite or PostgreSQL, chosen by URL, with the same behaviour. The queue holds the state of a job; its
+checkpoints and records are on disk (`jobs.store`).
 """
 
 from __future__ import annotations
 
 import logging
-import re
 import sqlite3
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from typing import Any, Final
-from urllib.parse import unquote
+from typing import Any
 
-import psycopg  # DBOS depends on it and on SQLAlchemy, so both are always there
+import psycopg  # DBOS depends on it and on SQLAlchemy
 from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, EnqueueOptions, WorkflowStatus
 from dbos import error as dbos_error
-from sqlalchemy import exc, make_url
+from sqlalchemy import exc
 
-from jobs.job import JobConflict, JobError, JobState, Outcome
-
-LOG = logging.getLogger(__name__)
+from jobs.database_url import SQLITE_PREFIX, cannot_open, no_answer, with_connection_limits
+from jobs.job import JobConflict, JobState, Outcome
 
 QUEUE = "train"
 WORKFLOW = "train"
 APPLICATION = "graings"
-# Of the sequence of steps, not of the program: a job that is under way stays with workers of the same version.
-# Count it up only when the steps of the workflow change.
+# The version of the workflow's steps, not of the program: DBOS gives an interrupted job only to workers of the same
+# version. Increase it only when the steps change.
 VERSION = "jobs-1"
 POLL_S = 0.5
 
-# How long to wait for a PostgreSQL that is out of reach: five seconds for a connection, a quarter of a minute for the
-# answer of another machine's kernel, half a minute for a silent connection. What the URL says itself counts more.
-PATIENCE: Final = {
-    "connect_timeout": "5",
-    "tcp_user_timeout": "15000",
-    "keepalives": "1",
-    "keepalives_idle": "10",
-    "keepalives_interval": "5",
-    "keepalives_count": "3",
-}
-
-_SQLITE = "sqlite:///"
-# What a query raises when there is no connection to be had.
-_AWAY = (
+# What a query raises when the database does not answer.
+_CONNECTION_ERRORS = (
     exc.OperationalError,
     exc.InterfaceError,
     exc.TimeoutError,
@@ -65,7 +50,7 @@ _STATES = {
 
 @dataclass(frozen=True, slots=True)
 class QueueEntry:
-    """A job's place in the queue: its state, who has it, and when (Unix seconds) and why it ended."""
+    """A job in the queue. `executor` is the id of its worker; `finished_at` is in Unix seconds."""
 
     job_id: str
     state: JobState
@@ -75,103 +60,100 @@ class QueueEntry:
 
 
 class Engine:
-    """The queue, seen from outside. Safe to use from several threads.
-
-    All methods raise `JobError` while the database is away.
-    """
+    """A client of the queue. Thread-safe. All methods raise `JobError` if the database does not answer."""
 
     def __init__(self, url: str) -> None:
         self.url = url
         try:
-            patient = _with_patience(url)
-            _prepare(patient)
+            limited = with_connection_limits(url)
+            _prepare(limited)
             self._client = DBOSClient(
-                system_database_url=patient,
+                system_database_url=limited,
                 application_name=APPLICATION,
                 serializer=DBOSPortableJSONSerializer(),
-                # Otherwise every caller waits until the database is back, and holds a thread of the service meanwhile.
+                # With retries every caller would wait until the database is back, and block a thread of the service.
                 retry_connection_errors=False,
             )
-        except Exception as error:  # whatever the database driver raises, it means one thing
+        except Exception as error:  # drivers raise many classes here
             raise cannot_open(url, error) from error
 
     @contextmanager
-    def _asking(self) -> Iterator[None]:
-        """Have what the database raises when it is away mean one thing, in words without its URL."""
+    def _connection_errors(self) -> Iterator[None]:
+        """Raise `JobError` without the URL in place of a driver's error."""
         try:
             yield
-        except _AWAY as error:
+        except _CONNECTION_ERRORS as error:
             raise no_answer(self.url, error) from error
 
     def enqueue(self, job_id: str, priority: int) -> None:
-        """Put a job in the queue; one that is there already stays as it is."""
+        """Put a job in the queue; a job that is already there is not changed."""
         options: EnqueueOptions = {
             "workflow_name": WORKFLOW,
             "queue_name": QUEUE,
             "workflow_id": job_id,
             "priority": priority,
         }
-        with self._asking():
+        with self._connection_errors():
             self._client.enqueue(options, job_id)
 
     def entries(self, job_ids: Sequence[str]) -> dict[str, QueueEntry]:
-        """The places of these jobs; those the queue does not know are left out."""
+        """The entries of these jobs by id, without those that are not in the queue."""
         if not job_ids:
             return {}
-        with self._asking():
-            found = self._client.list_workflows(workflow_ids=list(job_ids), load_input=False)
-        return {status.workflow_id: _ticket(status) for status in found}
+        with self._connection_errors():
+            statuses = self._client.list_workflows(workflow_ids=list(job_ids), load_input=False)
+        return {status.workflow_id: _entry(status) for status in statuses}
 
     def running(self) -> list[QueueEntry]:
-        """All jobs that a worker has taken, whether or not it still lives."""
-        return [_ticket(status) for status in self._in_state("PENDING")]
+        """All jobs that a worker has taken, also those of workers that died."""
+        return [_entry(status) for status in self._in_state("PENDING")]
 
     def waiting(self) -> int:
         """How many jobs wait for a worker."""
         return len(self._in_state("ENQUEUED"))
 
     def _in_state(self, status: str) -> list[WorkflowStatus]:
-        with self._asking():
+        with self._connection_errors():
             return self._client.list_workflows(status=status, name=WORKFLOW, load_input=False, load_output=False)
 
     def cancel(self, job_id: str) -> None:
         """Take a job out of the queue; its worker, if any, stops within two seconds."""
-        with self._asking():
+        with self._connection_errors():
             self._client.cancel_workflow(job_id)
 
     def requeue(self, job_ids: Sequence[str]) -> None:
-        """Put jobs that were cancelled or lost their worker back in the queue.
+        """Put jobs back in the queue that were cancelled or whose worker died.
 
-        Raises `JobConflict`, and leaves all of them where they are, when the queue does not know one.
+        Raises `JobConflict`, and changes none of them, if one is not in the queue's records.
         """
         if not job_ids:
             return
         try:
-            with self._asking():
-                # Without a name they would land in DBOS's internal queue, which has no limit on concurrency.
+            with self._connection_errors():
+                # Without a name they would go to DBOS's internal queue, which has no limit on concurrency.
                 self._client.resume_workflows(list(job_ids), queue_name=QUEUE)
         except dbos_error.DBOSNonExistentWorkflowError as error:
-            raise _unknown(job_ids) from error
+            raise _no_entry(job_ids) from error
 
     def rewind(self, job_id: str) -> None:
         """Put a job that ended back in the queue.
 
-        Raises `JobConflict` when it has not ended, or no longer, or the queue does not know it.
+        Raises `JobConflict` if the job has not ended, if another process was first, or if the queue has no entry of it.
         """
         try:
-            with self._asking():
+            with self._connection_errors():
                 self._client.rewind_workflow(job_id, queue_name=QUEUE, application_version=VERSION)
         except dbos_error.DBOSNonExistentWorkflowError as error:
-            raise _unknown([job_id]) from error
-        except dbos_error.DBOSException as error:  # the other things it can mean are all one: somebody else was at it
+            raise _no_entry([job_id]) from error
+        except dbos_error.DBOSException as error:  # all others mean that another process changed the job meanwhile
             raise JobConflict(
-                f"Job {job_id} changed its state while it was put back in the queue. Look at it, and retry if it "
-                "still needs that."
+                f"Job {job_id} changed its state while it was put back in the queue. Look at its state, and retry if "
+                "that is still needed."
             ) from error
 
     def delete(self, job_id: str) -> None:
-        """Forget a job."""
-        with self._asking():
+        """Remove the entry of a job."""
+        with self._connection_errors():
             self._client.delete_workflow(job_id)
 
     def close(self) -> None:
@@ -182,11 +164,11 @@ class Engine:
 def executing(url: str, executor: str, slots: int, run: Callable[[str], Awaitable[Outcome]]) -> Iterator[None]:
     """Take jobs from the queue while the context lasts, `slots` at a time, and await `run(job_id)` for each.
 
-    `run` is cancelled within two seconds when its job is, and when the context ends; it then has ten seconds. Once per
-    process. `slots` is a property of the queue: the value of the worker that started last counts for all.
+    `run` is cancelled within two seconds after its job is cancelled or the context ends; it then has ten seconds. Enter
+    it only once per process. `slots` is a property of the queue: the last worker to start sets it for all workers.
     """
     _prepare(url)
-    # DBOS reports a normal cancellation as a traceback; what matters reaches the job's own record and log.
+    # DBOS logs a normal cancellation as an error with a traceback. Real errors are in the job's own record and log.
     config = DBOSConfig(
         name=APPLICATION,
         system_database_url=url,
@@ -218,14 +200,15 @@ def executing(url: str, executor: str, slots: int, run: Callable[[str], Awaitabl
 
 def _prepare(url: str) -> None:
     logging.getLogger("dbos").setLevel(logging.CRITICAL)
-    if url.startswith(_SQLITE):
-        # Readers do not wait for writers, and a recorded step costs a third. The file remembers it.
-        with closing(sqlite3.connect(url.removeprefix(_SQLITE), timeout=30.0)) as database:
+    if url.startswith(SQLITE_PREFIX):
+        # With a write-ahead log readers do not wait for writers, and recording a step takes a third of the time. The
+        # setting is stored in the file.
+        with closing(sqlite3.connect(url.removeprefix(SQLITE_PREFIX), timeout=30.0)) as database:
             database.execute("PRAGMA journal_mode=WAL")
     DBOS.migrate(url)
 
 
-def _ticket(status: WorkflowStatus) -> QueueEntry:
+def _entry(status: WorkflowStatus) -> QueueEntry:
     error: str | None = None
     if status.status == "SUCCESS":
         output = status.output or {}
@@ -233,82 +216,15 @@ def _ticket(status: WorkflowStatus) -> QueueEntry:
     else:
         state = _STATES[status.status]
         if state is JobState.FAILED:
-            error = f"The worker could not run this job: {status.error}. Its log may say more."
+            error = f"The worker could not run this job: {status.error}. Its log may have the cause."
     finished = status.completed_at
     return QueueEntry(
         status.workflow_id, state, status.executor_id, None if finished is None else finished / 1000.0, error
     )
 
 
-def _unknown(job_ids: Sequence[str]) -> JobConflict:
+def _no_entry(job_ids: Sequence[str]) -> JobConflict:
     return JobConflict(
-        f"The queue has no entry for job {', '.join(job_ids)}: it was deleted, or its files are damaged. Mend what its "
-        "error names and start the service again, which gives it an entry; or delete it and submit it anew."
+        f"The queue has no entry for job {', '.join(job_ids)}: it was deleted, or its files are damaged. Repair the "
+        "file that its error names and restart the service, which adds an entry; or delete it and submit the job again."
     )
-
-
-def _with_patience(url: str) -> str:
-    if url.startswith(_SQLITE):
-        return url
-    parts = make_url(url)
-    return parts.set(query={**PATIENCE, **parts.query}).render_as_string(hide_password=False)
-
-
-def cannot_open(url: str, error: Exception) -> JobError:
-    """What to say, without any secret, to whoever gave this URL of a database that does not open."""
-    if _is_clear(url):
-        return JobError(f"The job database{_named(url)} cannot be opened: {_why(url, error)}")
-    return JobError(
-        f"The job database{_named(url)} cannot be opened: its URL is wrong or ambiguous. Write it like "
-        "sqlite:///path or postgresql://user:password@host/database, and write @ / ? and % in a password as %40 %2F "
-        "%3F and %25"
-    )
-
-
-def no_answer(url: str, error: Exception) -> JobError:
-    """What to say while the database is away. Why goes to the log: who asks the service need not know its inside."""
-    LOG.warning("the job database%s does not answer: %s", _named(url), _why(url, error))
-    return JobError("The job database does not answer at the moment. Try again in a few seconds.")
-
-
-# A PostgreSQL URL that all drivers take apart alike. Of any other, one may take for a host or a port, and name in its
-# message, what another takes for a part of the password.
-_CODE = "%[0-9A-Fa-f]{2}"
-_CLEAR = re.compile(
-    r"postgres(?:ql)?(?:\+\w+)?://"
-    rf"(?:(?:[^:@/?%\s]|{_CODE})*(?::(?P<password>(?:[^@/?%\s]|{_CODE})*))?@)?"  # user, password
-    rf"(?:(?:[\w.-]|{_CODE})*|\[[0-9A-Fa-f:.]+\])(?::\d+)?"  # host, port
-    r"(?:/[\w.-]*)?"  # database
-    rf"(?:\?(?P<query>\w+=(?:[^@%\s]|{_CODE})*))?"
-)
-
-
-def _is_clear(url: str) -> bool:
-    return url.startswith(_SQLITE) or _CLEAR.fullmatch(url) is not None
-
-
-def _named(url: str) -> str:
-    """The part of a URL that holds no secret, to follow a noun; nothing where that is not certain."""
-    if url.startswith(_SQLITE):
-        return f" {url}"
-    scheme = re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", url)
-    return "" if scheme is None else f" {scheme[0]}…"
-
-
-def _why(url: str, error: Exception) -> str:
-    """The first line of a driver's message, without the secrets of the URL it speaks of."""
-    if not _is_clear(url):
-        return type(error).__name__
-    why = (str(error).splitlines() or [repr(error)])[0]
-    for secret in _secrets(url):
-        why = re.sub(rf"(?<!\w){re.escape(secret)}(?!\w)", "…", why)
-    return why
-
-
-def _secrets(url: str) -> set[str]:
-    clear = _CLEAR.fullmatch(url)
-    if clear is None:
-        return set()
-    pairs = [pair.partition("=") for pair in (clear["query"] or "").split("&")]
-    written = {clear["password"] or "", *(value for key, _, value in pairs if "pass" in key)}
-    return {form for secret in written for form in (secret, unquote(secret)) if form}

@@ -1,4 +1,4 @@
-"""ExitCode: what the trainer process says with its exit status, after sysexits.h where that has a word for it."""
+"""ExitCode: the exit statuses of the trainer process, after sysexits.h where it has a matching one."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """Exit status of `python -m jobs.trainer_process`. A negative status is the signal that killed it."""
+    """Exit status of `python -m jobs.trainer_process`. A negative status is the number of the signal that killed it."""
 
     DONE = 0
-    """Trained to the end; metrics are written."""
+    """Training is complete; the metrics are written."""
     CRASHED = 1
-    """An error nobody foresaw; the log has the traceback. Tried once more."""
+    """An unexpected error; the log has the traceback. Tried once more."""
     USAGE = 2
     """Wrong arguments."""
     REFUSED = 65
-    """The capture, the options or the checkpoint cannot be used; the message has the remedy. Never tried again."""
+    """The capture, the options or the checkpoint cannot be used; the message has the remedy. Not tried again."""
     BUSY = 73
     """Another process trains in this job folder. Tried once more."""
     STOPPED = 75
-    """Asked to stop (SIGTERM, SIGINT or the parent died); a checkpoint is written and training can continue."""
+    """Stopped by SIGTERM, SIGINT or the end of the parent, at a checkpoint from which training can continue."""
     DIVERGED = 76
-    """Training came apart once more than it may go back; the best model is the newest checkpoint. Never tried again."""
+    """Training diverged and has used all its rollbacks; the best model is the newest checkpoint. Not tried again."""
 
 
 OUT_OF_MEMORY = (-9, 137)
-"""Statuses of a process that the kernel killed, most likely for its memory."""
+"""Statuses of a process killed by SIGKILL, which the kernel sends when memory runs out."""

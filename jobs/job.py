@@ -1,11 +1,11 @@
-"""Job: one training run that somebody asked for.
+"""Job: one training run in the queue, and its states.
 
                  ┌──────── resume ────────┐
                  ▼                        │
     ─ submit ▶ queued ─── cancel ──▶ cancelled
                │  ▲ ▲                     ▲
         a worker  │ │ its worker died     │
-        takes it  │ │ or left             │
+        takes it  │ │ or was stopped      │
                ▼  │ │                     │
              running ───── cancel ────────┘
                │  │
@@ -13,8 +13,7 @@
                ▼
            succeeded
 
-Whatever happens the last checkpoint is kept, and a job that is queued again continues from it. Plain data: knows
-nothing of files, databases or HTTP.
+The last checkpoint is always kept, and a job that is queued again continues from it.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _ID = re.compile(ID_PATTERN)
 
 
 class JobState(StrEnum):
-    """Where a job is in its life."""
+    """The state of a job."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -42,12 +41,12 @@ class JobState(StrEnum):
 
     @property
     def final(self) -> bool:
-        """Whether nothing more happens to the job by itself."""
+        """Whether the job stays in this state until a client changes it."""
         return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
 class JobError(Exception):
-    """Root of what can go wrong with a job; each message names the job and a remedy."""
+    """Base class of the errors of jobs; each message names the job and a remedy."""
 
 
 class JobNotFound(JobError):
@@ -58,16 +57,16 @@ class JobNotFound(JobError):
 
 
 class JobDamaged(JobError):
-    """What is stored of a job cannot be read."""
+    """A file of the job cannot be read."""
 
 
 class JobConflict(JobError):
-    """The job's state forbids what was asked of it."""
+    """The job's state does not allow the request."""
 
 
 @dataclass(frozen=True, slots=True)
 class JobSpec:
-    """What was asked for. `capture` is the sha256 of the uploaded archive, `config` a whole `TrainConfig` as JSON.
+    """A submitted job. `capture` is the SHA-256 of the uploaded archive, `config` a whole `TrainConfig` as JSON.
 
     Jobs with a lower `priority` start first.
     """
@@ -82,8 +81,8 @@ class JobSpec:
 class Attempt:
     """One start of the trainer. `checkpoint` is the iteration it continued from (0: from the beginning).
 
-    `exit_code` is null while it runs, and stays null when its worker died with it. `final` marks an attempt after
-    which the job ended, so that a retry starts counting anew. Times are Unix seconds.
+    `exit_code` is None while it runs, and stays None when its worker dies. `final` marks the attempts of a job that
+    ended, so that a retry does not count them. Times are Unix seconds.
     """
 
     number: int
@@ -106,9 +105,10 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job as a front end sees it. Times are Unix seconds; `progress` is the trainer's last report.
+    """A job with its state, as clients see it.
 
-    `checkpoint` is the iteration of the newest one.
+    Times are Unix seconds, `progress` is the trainer's last report as JSON, `checkpoint` is the iteration of the newest
+    checkpoint.
     """
 
     id: str
@@ -126,12 +126,12 @@ class Job:
 
 
 def is_id(name: str) -> bool:
-    """Whether this has the form of an id."""
+    """Whether `name` has the form of a job id."""
     return _ID.fullmatch(name) is not None
 
 
 def check_id(job_id: str) -> str:
-    """The id itself when it has the form of one, so that it is safe in a path. Raises `JobNotFound`."""
+    """`job_id` itself, checked to have the form of an id and so to be safe in a path. Raises `JobNotFound`."""
     if not is_id(job_id):
         raise JobNotFound(job_id)
     return job_id

@@ -1,8 +1,7 @@
-"""Lease: is that worker alive?
+"""Leases: which workers are alive.
 
-The answer comes from the kernel (`flock`, one machine) or from PostgreSQL (a session's advisory lock, many
-machines): both let go by themselves when the holder dies, so no clock and no heartbeat is involved. Knows nothing of
-jobs but how it is said that their database is away.
+A worker holds a lease as long as it lives: a locked file (`flock`, on one machine) or an advisory lock of a PostgreSQL
+session (on many machines). The kernel or the server releases it when the worker dies, without clocks or heartbeats.
 """
 
 from __future__ import annotations
@@ -17,42 +16,42 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
-import psycopg  # DBOS depends on it, so it is always there
+import psycopg  # DBOS depends on it
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from jobs.engine import PATIENCE, cannot_open, no_answer
+from jobs.database_url import CONNECTION_LIMITS, cannot_open, no_answer
 
 LOG = logging.getLogger(__name__)
 
-_NAMESPACE = 0x67726169  # "grai": first key of our advisory locks, apart from everybody else's
-# How long to wait for those who ask at the same time: somewhat longer than one of them waits for a connection.
-_TURN_S = 10.0
+_NAMESPACE = 0x67726169  # "grai": first key of our advisory locks, which separates them from those of other programs
+# How long a thread waits for the session, in seconds: longer than another thread needs to open a connection.
+_SESSION_WAIT_S = 10.0
 
 
 class Leases(Protocol):
-    """Named locks that die with their holder. Methods raise `JobError` while whoever keeps the locks is away."""
+    """Named locks, released when their holder dies. Methods raise `JobError` if the database does not answer."""
 
-    def take(self, name: str) -> bool:
-        """Take the lease for ourselves; False when somebody else holds it."""
+    def acquire(self, name: str) -> bool:
+        """Take the lease; False if another process holds it."""
 
-    def keep(self, name: str) -> bool:
-        """Make sure that we still hold a lease we took, taking it again where it was lost; False if we cannot."""
+    def renew(self, name: str) -> bool:
+        """Whether we still hold a lease that we acquired; acquires it again if our session was closed meanwhile."""
 
-    def take_from_the_dead(self, name: str) -> bool:
-        """Take another holder's lease; False when that holder lives. `release` it after clearing up."""
+    def acquire_from_dead(self, name: str) -> bool:
+        """Take the lease of another worker; False if that worker is alive. Call `release` after cleaning up."""
 
     def release(self, name: str) -> None:
-        """Let a lease go for good: its name is not used again."""
+        """Release a lease for good: its name is not used again."""
 
     def alive(self) -> int:
-        """How many leases are held at the moment, by anybody."""
+        """How many leases are held now, by any process."""
 
     def close(self) -> None:
-        """Let everything go."""
+        """Release everything."""
 
 
 class FileLeases:
-    """Leases on one machine: a locked file each. A file that is gone is a holder that left."""
+    """Leases on one machine: one locked file each. A missing file means that the holder has ended."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -71,17 +70,17 @@ class FileLeases:
             return None
         return handle
 
-    def take(self, name: str) -> bool:
+    def acquire(self, name: str) -> bool:
         handle = self._lock(name, os.O_CREAT)
         if handle is None:
             return False
         self._held[name] = handle
         return True
 
-    def keep(self, name: str) -> bool:
+    def renew(self, name: str) -> bool:
         return name in self._held
 
-    def take_from_the_dead(self, name: str) -> bool:
+    def acquire_from_dead(self, name: str) -> bool:
         try:
             handle = self._lock(name, 0)
         except FileNotFoundError:
@@ -108,7 +107,7 @@ class FileLeases:
             except FileNotFoundError:
                 continue
             try:
-                # Shared, so that two who look at the same time do not take each other for a holder.
+                # Shared, so that two processes that count at the same time do not count each other.
                 fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 held += 1
@@ -124,8 +123,7 @@ class FileLeases:
 class PostgresLeases:
     """Leases on many machines: advisory locks of one PostgreSQL session, released by the server when it ends.
 
-    A session that ended, as all do when the server starts again, is followed by another one that holds nothing until
-    `keep` takes it again. Safe to use from several threads.
+    When the server closes the session, as in a restart, a new one is opened, without locks until `renew`. Thread-safe.
     """
 
     def __init__(self, url: str) -> None:
@@ -138,30 +136,31 @@ class PostgresLeases:
             raise cannot_open(url, error) from error
 
     def _connect(self) -> psycopg.Connection[tuple[object, ...]]:
-        return psycopg.connect(make_conninfo("", **{**PATIENCE, **conninfo_to_dict(self._url)}), autocommit=True)
+        parameters = {**CONNECTION_LIMITS, **conninfo_to_dict(self._url)}
+        return psycopg.connect(make_conninfo("", **parameters), autocommit=True)
 
     @staticmethod
     def _key(name: str) -> int:
         return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big", signed=True)
 
-    def _ask(self, query: str, *values: int) -> object:
-        """The one value that a query gives, from a new session where the old one was lost. Raises `JobError`."""
+    def _query(self, query: str, *values: int) -> object:
+        """The single value of a query, in a new session if the old one was closed. Raises `JobError`."""
         try:
-            with self._turn():
+            with self._session():
                 try:
                     return self._value(query, *values)
                 except psycopg.OperationalError:
                     self._reconnect()
-                    LOG.warning("the session that holds leases was lost; another one takes its place")
+                    LOG.warning("the database session that holds the leases was closed; opened a new one")
                     return self._value(query, *values)
         except (psycopg.OperationalError, TimeoutError) as error:
             raise no_answer(self._url, error) from error
 
     @contextmanager
-    def _turn(self) -> Iterator[None]:
-        # With a limit: where no connection is to be had, those who wait would otherwise wait for each other in turn.
-        if not self._guard.acquire(timeout=_TURN_S):
-            raise TimeoutError("others wait for it already")
+    def _session(self) -> Iterator[None]:
+        # With a limit: otherwise, when the database does not answer, each of many threads waits for all before it.
+        if not self._guard.acquire(timeout=_SESSION_WAIT_S):
+            raise TimeoutError("other threads wait for it already")
         try:
             yield
         finally:
@@ -176,27 +175,27 @@ class PostgresLeases:
         self._held.clear()
         self._connection = self._connect()
 
-    def take(self, name: str) -> bool:
-        taken = self._ask("select pg_try_advisory_lock(%s, %s)", _NAMESPACE, self._key(name)) is True
-        if taken:
+    def acquire(self, name: str) -> bool:
+        acquired = self._query("select pg_try_advisory_lock(%s, %s)", _NAMESPACE, self._key(name)) is True
+        if acquired:
             self._held.add(name)
-        return taken
+        return acquired
 
-    def keep(self, name: str) -> bool:
-        self._ask("select 1")  # a lost session has lost its locks, which nobody says unless asked
-        return name in self._held or self.take(name)
+    def renew(self, name: str) -> bool:
+        self._query("select 1")  # notices a closed session, which no longer holds its locks
+        return name in self._held or self.acquire(name)
 
-    def take_from_the_dead(self, name: str) -> bool:
-        return self.take(name)
+    def acquire_from_dead(self, name: str) -> bool:
+        return self.acquire(name)
 
     def release(self, name: str) -> None:
         if name in self._held:
             self._held.discard(name)
-            self._ask("select pg_advisory_unlock(%s, %s)", _NAMESPACE, self._key(name))
+            self._query("select pg_advisory_unlock(%s, %s)", _NAMESPACE, self._key(name))
 
     def alive(self) -> int:
-        # The view shows the locks of all databases of the server.
-        count = self._ask(
+        # The view has the locks of all databases of the server.
+        count = self._query(
             "select count(*) from pg_locks where locktype = 'advisory' and classid = %s and granted"
             " and database = (select oid from pg_database where datname = current_database())",
             _NAMESPACE,
@@ -208,5 +207,5 @@ class PostgresLeases:
 
 
 def open_leases(database_url: str, folder: Path) -> Leases:
-    """Leases that reach as far as the database does."""
+    """Leases for all processes that share the database: files in `folder` for SQLite, else in PostgreSQL."""
     return FileLeases(folder) if database_url.startswith("sqlite") else PostgresLeases(database_url)

@@ -1,7 +1,6 @@
-"""Parent watch: notice that the process which started this one is gone.
+"""Parent watch: notice that the parent process has ended.
 
-The parent keeps the other end of our standard input open; when it dies, however it dies, the kernel closes it. Knows
-nothing of what to do then.
+The parent holds the other end of this process's standard input; the kernel closes it when the parent ends or is killed.
 """
 
 from __future__ import annotations

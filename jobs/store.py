@@ -1,11 +1,11 @@
 """Store: captures and jobs on disk.
 
     <root>/captures/<sha256>/    an unpacked capture, shared by all jobs that use it
-    <root>/jobs/<id>/            job.json, attempts.json, progress.jsonl, log.txt, lock, run/ (the trainer's own)
-    <root>/uploads/              archives on their way in
+    <root>/jobs/<id>/            job.json, attempts.json, progress.jsonl, log.txt, lock, run/ (the folder of the run)
+    <root>/uploads/              archives that are being uploaded or unpacked
     <root>/workers/              leases of workers on this machine
 
-Every file appears whole or not at all. The store knows nothing of queues: whether a job runs is not its concern.
+Every file is replaced atomically. The state of a job is not here but in the queue (`jobs.engine`).
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from graings.storage.files import sync_folder, sync_tree, write_json
 from graings.storage.run_folder import MODEL_FILE, newest_checkpoint
-from jobs.files import locked, sync_folder, sync_tree, write_json
 from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
+from jobs.locks import locked
 
 LOG = logging.getLogger(__name__)
 
 KEPT_ATTEMPTS = 50
-# An upload to which nothing was written for so long has nobody who works on it.
+# An upload without a write for so long belongs to a process that died.
 LEFTOVER_S = 3_600.0
 
 
@@ -71,17 +72,19 @@ class JobFolder:
         return self.run / MODEL_FILE
 
     def spec(self) -> JobSpec:
-        """What was asked for. Raises `JobDamaged`, and `JobNotFound` for a job that was deleted meanwhile."""
+        """The specification. Raises `JobDamaged`, and `JobNotFound` if the job was deleted meanwhile."""
         file = self.path / "job.json"
         try:
             return JobSpec(**json.loads(file.read_text())["spec"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             if not self.path.is_dir():
                 raise JobNotFound(self.path.name) from error
-            raise JobDamaged(f"{file}: not readable ({error!r}). Delete the job and send its capture again.") from error
+            raise JobDamaged(
+                f"{file}: not readable ({error!r}). Delete the job and submit its capture again."
+            ) from error
 
     def created_at(self) -> float:
-        """Unix seconds; ids begin with them."""
+        """Unix seconds, which are the first part of the id."""
         return int(self.path.name[:11], 16) / 1000.0
 
     def checkpoint(self) -> int | None:
@@ -90,17 +93,17 @@ class JobFolder:
         return None if newest is None else int(newest.name)
 
     def attempts(self) -> list[Attempt]:
-        """The last starts of the trainer, oldest first."""
+        """The last `KEPT_ATTEMPTS` starts of the trainer, oldest first."""
         file = self.path / "attempts.json"
         try:
             return [Attempt(**values) for values in json.loads(file.read_text())]
         except FileNotFoundError:
             return []
         except (OSError, ValueError, TypeError) as error:
-            raise JobDamaged(f"{file}: not readable ({error!r}). Remove that file; only a count is lost.") from error
+            raise JobDamaged(f"{file}: not readable ({error!r}). Remove that file.") from error
 
     def begin_attempt(self, worker: str) -> Attempt:
-        """Record a start, before it happens: a start that kills its worker counts too."""
+        """Record a start of the trainer, before it happens: a start that kills its worker counts too."""
         attempts = self.attempts()
         number = attempts[-1].number + 1 if attempts else 1
         attempt = Attempt(number, worker, time.time(), self.checkpoint() or 0)
@@ -110,18 +113,18 @@ class JobFolder:
     def end_attempt(self, attempt: Attempt, exit_code: int, message: str | None = None) -> None:
         """Record how an attempt ended."""
         ended = replace(attempt, ended_at=time.time(), exit_code=exit_code, message=message)
-        self._write_attempts([ended if one.number == attempt.number else one for one in self.attempts()])
+        self._write_attempts([ended if old.number == attempt.number else old for old in self.attempts()])
 
     def close_attempts(self) -> None:
-        """The job has ended: what happened so far no longer counts against the attempts to come."""
-        self._write_attempts([replace(one, final=True) for one in self.attempts()])
+        """Mark all attempts as final when the job has ended, so that a retry does not count them."""
+        self._write_attempts([replace(attempt, final=True) for attempt in self.attempts()])
 
     def _write_attempts(self, attempts: list[Attempt]) -> None:
-        write_json(self.path / "attempts.json", [asdict(one) for one in attempts[-KEPT_ATTEMPTS:]])
+        write_json(self.path / "attempts.json", [asdict(attempt) for attempt in attempts[-KEPT_ATTEMPTS:]])
 
 
 class Store:
-    """The folder that holds everything; see the module for its layout."""
+    """The data folder; see the module for its layout."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.resolve()
@@ -133,26 +136,26 @@ class Store:
             folder.mkdir(parents=True, exist_ok=True)
 
     def capture(self, digest: str) -> Path:
-        """Where the capture's files begin."""
+        """The folder with the files of a capture."""
         return capture_root(self._captures / digest)
 
     def create(self, spec: JobSpec, unpacked: Path) -> str:
-        """A new job whose capture lies in the folder `unpacked`, which is moved into the store. Returns its id."""
+        """Add a job whose capture is in the folder `unpacked`, which is moved into the store. Returns the id."""
         now = time.time()
         job_id = f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
-        sync_tree(unpacked)  # a job that the disk remembers must not have lost its images
+        sync_tree(unpacked)  # after a power failure no job may be there without its images
         with self._changing():
             capture = self._captures / spec.capture
             if _files(capture) == _files(unpacked):
                 shutil.rmtree(unpacked)
             else:
-                # New, or a file of it was lost since: what has just arrived is whole.
+                # A new capture, or one with missing files: replace it with the complete upload.
                 if capture.exists():
                     capture.rename(self.uploads / f"{job_id}.replaced")
                 unpacked.rename(capture)
                 sync_folder(self._captures)
                 shutil.rmtree(self.uploads / f"{job_id}.replaced", ignore_errors=True)
-            # The record is written first and the folder renamed last: a folder in jobs/ always has its record.
+            # The folder is renamed after its record is written: a folder in jobs/ always has its record.
             part = self.uploads / f"{job_id}.job"
             part.mkdir()
             write_json(part / "job.json", {"id": job_id, "created_at": now, "spec": asdict(spec)})
@@ -168,73 +171,73 @@ class Store:
         return JobFolder(path)
 
     def ids(self) -> list[str]:
-        """All jobs, newest first: ids begin with the time. What else lies in their folder is none of ours."""
-        found = [one.name for one in self._jobs.iterdir() if is_id(one.name) and one.is_dir()]
-        return sorted(found, reverse=True)
+        """All jobs, newest first, since ids begin with the time. Other files in their folder are ignored."""
+        names = [path.name for path in self._jobs.iterdir() if is_id(path.name) and path.is_dir()]
+        return sorted(names, reverse=True)
 
     def delete(self, job_id: str) -> None:
-        """Remove a job, and its capture when no other job uses it. Raises `JobConflict` while its trainer is at it."""
+        """Remove a job, and its capture if no other job uses it. Raises `JobConflict` while its trainer runs."""
         folder = self.folder(job_id)
         with self._changing(), locked(folder.lock, wait=False) as free:
             if not free:
                 raise JobConflict(f"Job {job_id} is still writing its checkpoint. Try again in a few seconds.")
-            bin_ = self.uploads / f"{job_id}.deleted"
-            os.utime(folder.path)  # so that nobody else takes it for a leftover meanwhile
-            folder.path.rename(bin_)
-            shutil.rmtree(bin_)
+            deleted = self.uploads / f"{job_id}.deleted"
+            os.utime(folder.path)  # so that no other process takes it for a leftover meanwhile
+            folder.path.rename(deleted)
+            shutil.rmtree(deleted)
             try:
                 used = {self.folder(other).spec().capture for other in self.ids()}
             except JobDamaged:
-                return  # a capture that nobody seems to use may be that job's
+                return  # any capture that seems unused may be that of the damaged job
             for capture in self._captures.iterdir():
                 if capture.name not in used:
                     shutil.rmtree(capture, ignore_errors=True)
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
-        """One at a time adds or removes jobs and captures, whichever process it is in."""
+        """Only one process at a time adds or removes jobs and captures."""
         with locked(self.root / "store.lock"):
             yield
 
 
 def discard_leftovers(uploads: Path) -> None:
-    """Remove what processes that died left in `uploads`; other processes may be at work on the rest.
+    """Remove the uploads of processes that died; uploads of running processes stay.
 
-    What cannot be removed is logged and stays: it is no reason to refuse an upload.
+    A file that cannot be removed is only logged, so that it does not prevent the next upload.
     """
-    # An archive is only read while it is unpacked beside: paths of one upload have one name and live as long.
+    # The archive and the folder of one upload share a name. While unpacking, only the folder is written.
     groups: dict[str, list[Path]] = {}
-    for one in uploads.iterdir():
-        groups.setdefault(one.name.partition(".")[0], []).append(one)
+    for path in uploads.iterdir():
+        groups.setdefault(path.name.partition(".")[0], []).append(path)
     for paths in groups.values():
         try:
-            if time.time() - max(_last_write(one) for one in paths) < LEFTOVER_S:
+            if time.time() - max(_last_write(path) for path in paths) < LEFTOVER_S:
                 continue
-            for one in paths:
-                if one.is_dir():
-                    shutil.rmtree(one)
+            for path in paths:
+                if path.is_dir():
+                    shutil.rmtree(path)
                 else:
-                    one.unlink()
+                    path.unlink()
         except FileNotFoundError:
-            continue  # another process was faster
+            continue  # removed by another process meanwhile
         except OSError as error:
-            LOG.warning("What an upload left cannot be removed: %s", error)
+            LOG.warning("an abandoned upload cannot be removed: %s", error)
 
 
 def _last_write(path: Path) -> float:
     """Unix seconds of the last change to the file, or to anything in the folder. Raises `FileNotFoundError`."""
-    return max(one.lstat().st_mtime for one in (path, *path.rglob("*")))
+    return max(item.lstat().st_mtime for item in (path, *path.rglob("*")))
 
 
 def capture_root(folder: Path) -> Path:
-    """Where the files of an unpacked archive begin: below folders that hold nothing but one folder."""
+    """The folder with the files of an unpacked archive, below folders that contain nothing but one folder."""
     while True:
-        inside = list(folder.iterdir()) if folder.is_dir() else []
-        if len(inside) != 1 or not inside[0].is_dir():
+        content = list(folder.iterdir()) if folder.is_dir() else []
+        if len(content) != 1 or not content[0].is_dir():
             return folder
-        folder = inside[0]
+        folder = content[0]
 
 
 def _files(folder: Path) -> dict[str, int]:
-    """Sizes of the files below a folder, by path; none where it is missing."""
-    return {str(one.relative_to(folder)): one.stat().st_size for one in folder.rglob("*") if one.is_file()}
+    """Sizes of the files below a folder by path; empty if the folder is missing."""
+    return {str(path.relative_to(folder)): path.stat().st_size for path in folder.rglob("*") if path.is_file()}

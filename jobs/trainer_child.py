@@ -1,7 +1,6 @@
-"""TrainerChild: the worker's end of one trainer process.
+"""TrainerChild: start one trainer process, wait for it, and stop it.
 
-Starts the child, waits for it, stops it. Lives on an event loop; `stop` may be called from any thread. Knows nothing
-of queues or of training.
+Runs on an event loop; `stop` may be called from any thread.
 """
 
 from __future__ import annotations
@@ -14,19 +13,19 @@ from dataclasses import dataclass
 
 from jobs.store import JobFolder
 
-GRACE_S = 45.0  # loading a large capture or evaluating all held-out views cannot be interrupted
+GRACE_S = 45.0  # seconds; loading a large capture or evaluating all held-out views cannot be interrupted
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessExit:
-    """How the child ended: its exit code, negative for a signal, and its message if it left one."""
+    """Exit code of the child, negative for a signal, and its error message if it wrote one."""
 
     code: int
     message: str | None
 
 
 class TrainerChild:
-    """One child process training in one job folder."""
+    """A child process that trains in one job folder."""
 
     def __init__(self, folder: JobFolder, threads: int, grace_s: float = GRACE_S) -> None:
         self._folder = folder
@@ -38,16 +37,16 @@ class TrainerChild:
 
     @property
     def stopping(self) -> bool:
-        """Whether somebody asked this child to stop."""
+        """Whether `stop` was called."""
         return self._stopping
 
     async def run(self) -> ProcessExit:
-        """Start the child and wait for its end. When cancelled, has it write a checkpoint first."""
+        """Start the child and wait until it ends. If cancelled, stop the child at a checkpoint first."""
         with self._folder.log.open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "jobs.trainer_process", str(self._folder.path), "--threads", str(self._threads),
                 stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=log,
-                # A Ctrl-C in the worker's terminal is the worker's to pass on.
+                # A Ctrl-C in the terminal goes to the worker only, which then stops the child.
                 start_new_session=True,
             )  # fmt: skip
         if self._stopping:
@@ -61,7 +60,7 @@ class TrainerChild:
             raise
 
     def stop(self) -> None:
-        """Have the child write a checkpoint and end; it is killed when it does not within the grace time."""
+        """Make the child write a checkpoint and end; it is killed if it has not ended after the grace time."""
         self._loop.call_soon_threadsafe(self._stop)
 
     def _stop(self) -> None:
@@ -76,9 +75,9 @@ class TrainerChild:
             self._loop.call_later(self._grace_s, _kill, process)
 
     async def _wait(self, process: asyncio.subprocess.Process) -> ProcessExit:
-        assert process.stdout is not None  # asked for above
-        said = await process.stdout.read()
-        return ProcessExit(await process.wait(), _message(said))
+        assert process.stdout is not None  # a pipe, see `run`
+        output = await process.stdout.read()
+        return ProcessExit(await process.wait(), _message(output))
 
 
 def _kill(process: asyncio.subprocess.Process) -> None:
@@ -86,9 +85,9 @@ def _kill(process: asyncio.subprocess.Process) -> None:
         process.kill()
 
 
-def _message(said: bytes) -> str | None:
-    """The error in the child's last line, if it left one: a child that was killed could not."""
-    lines = said.decode("utf-8", "replace").strip().splitlines()
+def _message(output: bytes) -> str | None:
+    """The error in the last line of the child's output; None if it was killed before it could write one."""
+    lines = output.decode("utf-8", "replace").strip().splitlines()
     try:
         return str(json.loads(lines[-1])["error"]) if lines else None
     except (ValueError, KeyError, TypeError):

@@ -1,10 +1,9 @@
 """The child process that trains one job: `python -m jobs.trainer_process JOB_FOLDER --threads N`.
 
-A process of its own, so that it can have its own number of threads, give all its memory back, crash or be killed
-without taking its worker along. It continues from the newest checkpoint where there is one, appends its progress to
-the job's folder, and ends with an `ExitCode`; where that is an error, standard output is one JSON object with the
-message. SIGTERM, SIGINT or the end of its parent make it write a checkpoint and stop. The only module of this package
-that imports training. Knows nothing of queues.
+A separate process has its own number of threads, returns all its memory, and can crash or be killed without ending
+its worker. It continues from the newest checkpoint if there is one, appends its progress to the job's folder, and ends
+with an `ExitCode`; if that is an error, standard output is one JSON object with the message. SIGTERM, SIGINT or the end
+of its parent make it write a checkpoint and stop. This is the only module of `jobs` that imports training.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from graings.report.folder import report_runs
 from graings.training.run import TrainingRun
 from graings.training.run_output import RunReport
 from jobs.exit_code import ExitCode
-from jobs.files import locked
+from jobs.locks import locked
 from jobs.parent import watch_parent
 from jobs.progress import ProgressReport, ProgressWriter
 from jobs.store import JobFolder, Store
@@ -37,14 +36,14 @@ from jobs.store import JobFolder, Store
 REPORT_EVERY_S = 1.0
 LOG_EVERY_S = 15.0
 LOCK_WAIT_S = 60.0
-REPORT_BUDGET_S = 10.0  # of drawing the finished model for its report
+REPORT_BUDGET_S = 10.0  # for rendering the finished model for its report
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m jobs.trainer_process", description=__doc__)
     parser.add_argument("folder", type=Path, help="the job's folder in the store")
-    parser.add_argument("--threads", type=int, required=True, help="CPU threads, at most")
+    parser.add_argument("--threads", type=int, required=True, help="greatest number of CPU threads")
     arguments = parser.parse_args(argv)
 
     stop = threading.Event()
@@ -54,18 +53,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     folder = JobFolder(arguments.folder.resolve())
     deadline = time.monotonic() + LOCK_WAIT_S
     while not stop.is_set():
-        # An orphan of a worker that was killed may still be writing its last checkpoint: wait for it.
-        with locked(folder.lock, wait=False) as ours:
-            if ours:
-                return _guarded(folder, arguments.threads, stop)
+        # The trainer of a worker that was killed may still be writing its last checkpoint: wait for it.
+        with locked(folder.lock, wait=False) as acquired:
+            if acquired:
+                return _train_or_report(folder, arguments.threads, stop)
         if time.monotonic() > deadline:
-            return _end(ExitCode.BUSY, "Another process still trains in this job's folder.")
+            return _end(ExitCode.BUSY, f"{folder.path}: another process still trains in this folder. Wait for its end.")
         stop.wait(0.2)
     return ExitCode.STOPPED
 
 
-def _guarded(folder: JobFolder, threads: int, stop: threading.Event) -> int:
-    """Train, and turn whatever goes wrong into an exit code and a message."""
+def _train_or_report(folder: JobFolder, threads: int, stop: threading.Event) -> int:
+    """Train, and turn any error into an exit code and a message."""
     try:
         return _train(folder, threads, stop)
     except DivergedError as error:
@@ -73,7 +72,7 @@ def _guarded(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     except GraingsError as error:
         return _end(ExitCode.REFUSED, str(error))
     except Exception as error:
-        # The last frame of the process: the traceback goes to the log, the sentence to whoever asked for the job.
+        # The outermost frame of the process: the traceback goes to the log, the message to the client.
         traceback.print_exc()
         return _end(ExitCode.CRASHED, f"{type(error).__name__}: {error}. The log has the traceback.")
 
@@ -84,14 +83,14 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     threads = min(config.threads or threads, threads)
     capture = Store(folder.path.parent.parent).capture(spec.capture)
     checkpoint = folder.checkpoint()
-    starts = folder.attempts()  # the last ones
-    attempt = starts[-1].number if starts else 1
+    attempts = folder.attempts()
+    attempt = attempts[-1].number if attempts else 1
     progress = ProgressWriter(folder.progress)
     progress.write(
         ProgressReport(phase="loading", iteration=checkpoint or 0, iterations=config.iterations, attempt=attempt)
     )
     if checkpoint is None:
-        shutil.rmtree(folder.run, ignore_errors=True)  # what a start without a checkpoint left is worth nothing
+        shutil.rmtree(folder.run, ignore_errors=True)  # the incomplete run of an attempt without a checkpoint
         run = TrainingRun.create(capture, folder.run, config.model_copy(update={"threads": threads}))
     else:
         run = TrainingRun.resume(folder.run, capture=capture, threads=threads)
@@ -104,7 +103,7 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
             now = time.monotonic()
             if report.evaluation:
                 held_out = {"held_out_psnr": report.evaluation.psnr, "held_out_ssim_3dgs": report.evaluation.ssim_3dgs}
-            # Events are reported at once: a reader should not have to wait to learn that training went back.
+            # Events are reported at once, so that clients see a rollback without delay.
             last = report.iteration == report.iterations
             if report.events or report.evaluation or last or now - reported >= REPORT_EVERY_S:
                 progress.write(ProgressReport(**_values(report), **held_out, attempt=attempt))
@@ -134,12 +133,12 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
 
 
 def _report(folder: JobFolder) -> None:
-    """The whole work-precision report beside the model."""
+    """Write the work-precision report beside the model."""
     try:
         written = report_runs([folder.run], folder.report, budget_s=REPORT_BUDGET_S)
         _log("; ".join([f"report: {', '.join(written.files)}", *written.notes]))
     except Exception as error:
-        # The model is trained and saved: no trouble with describing it makes the job a failure.
+        # The model is trained and saved: an error in its report does not make the job fail.
         traceback.print_exc()
         _log(f"no report: {type(error).__name__}: {error}. Make it with: graings report {folder.run} -o DIR")
 
@@ -172,7 +171,7 @@ def _line(report: RunReport) -> str:
 
 
 def _log(text: str) -> None:
-    """One dated line in the job's log, which is our standard error."""
+    """Write one dated line to the job's log, which is standard error."""
     print(time.strftime("%Y-%m-%dT%H:%M:%S%z"), text, file=sys.stderr, flush=True)
 
 
@@ -183,7 +182,7 @@ def _end(code: ExitCode, message: str) -> int:
 
 
 if __name__ == "__main__":
-    # No interpreter shutdown: the parent watch is inside a read, and everything is on disk.
+    # Without interpreter shutdown, which would wait for the thread that reads standard input. All files are written.
     status = main()
     sys.stdout.flush()
     os._exit(status)

@@ -1,8 +1,7 @@
-"""Worker: takes jobs from the queue and has trainer processes do them.
+"""Worker: takes jobs from the queue and runs a trainer process for each.
 
-Keeps a lease for as long as it lives, puts the jobs of dead workers back in the queue, and stops its trainers when
-their jobs are cancelled, when they are no longer its own, or when it is asked to end. It never trains itself and holds
-no truth: that is the checkpoint on disk.
+It holds a lease as long as it lives, puts the jobs of dead workers back in the queue, and stops a trainer when its job
+is cancelled or given to another worker, or when the worker itself is stopped. All results are in the job's files.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from jobs.trainer_child import GRACE_S, ProcessExit, TrainerChild
 LOG = logging.getLogger(__name__)
 
 ROUND_S = 2.0
-# Starts that got no further than the one before: crashes of the trainer, and workers that died with it.
+# Attempts in a row without a new checkpoint: those in which the trainer crashed, and those in which the worker died.
 MAX_CRASHES = 2
-MAX_LOSSES = 5
+MAX_WORKER_DEATHS = 5
 
 
 class Worker:
@@ -42,65 +41,65 @@ class Worker:
         self._slots = slots
         self._threads = threads
         self._trainers: dict[str, TrainerChild] = {}
-        self._leaving = False
+        self._stopping = False
 
     def run(self, stop: threading.Event) -> None:
-        """Work until `stop` is set; then bring all trainers to a checkpoint and give their jobs back.
+        """Work until `stop` is set; then stop all trainers at a checkpoint and put their jobs back in the queue.
 
-        Where the database is away at that time, this ends the process, as nothing else would.
+        If the database does not answer then, this ends the process, because threads of DBOS would keep it alive.
         """
         engine = Engine(self._url)
         leases = open_leases(self._url, self._store.workers)
-        if not leases.take(self.id):
-            raise JobError(f"The lease of worker {self.id} is held by another process. Start it again.")
+        if not leases.acquire(self.id):
+            raise JobError(f"The lease of worker {self.id} is held by another process. Start the worker again.")
         try:
             with executing(self._url, self.id, self._slots, self._work):
                 LOG.info("worker %s takes jobs: %d at a time, %d threads each", self.id, self._slots, self._threads)
-                self._rounds(engine, leases, stop)
+                self._supervise(engine, leases, stop)
                 self._stop_all()
-            returned = self._give_back(engine)
+            returned = self._return_jobs(engine)
         finally:
             leases.close()
             engine.close()
-            LOG.info("worker %s has left", self.id)
+            LOG.info("worker %s ended", self.id)
         if not returned:
             _end_process()
 
-    def _give_back(self, engine: Engine) -> bool:
-        """Put the jobs that were still ours back in the queue; False when the database is away."""
+    def _return_jobs(self, engine: Engine) -> bool:
+        """Put our unfinished jobs back in the queue; False if the database does not answer."""
         try:
-            engine.requeue([ticket.job_id for ticket in engine.running() if ticket.executor == self.id])
+            engine.requeue([entry.job_id for entry in engine.running() if entry.executor == self.id])
         except JobError as error:
-            # The lease goes with us, so that the next worker to look finds them as those of a dead one.
-            LOG.warning("worker %s leaves its jobs to others: %s", self.id, error)
+            # The lease ends with this process, so that other workers requeue these jobs as those of a dead worker.
+            LOG.warning("worker %s could not return its jobs, other workers will: %s", self.id, error)
             return False
         return True
 
-    def _rounds(self, engine: Engine, leases: Leases, stop: threading.Event) -> None:
+    def _supervise(self, engine: Engine, leases: Leases, stop: threading.Event) -> None:
         while True:
             try:
-                if not leases.keep(self.id):
-                    LOG.error("worker %s lost its lease to another process and ends", self.id)
+                if not leases.renew(self.id):
+                    LOG.error("the lease of worker %s is now held by another process; the worker ends", self.id)
                     return
-                # Before asking: a trainer that starts in between belongs to a job not in the answer yet.
+                # Before the query: the job of a trainer that starts in between is not in its result yet.
                 trainers = list(self._trainers.items())
-                running = {ticket.job_id: ticket.executor for ticket in engine.running()}
-                reap(engine, leases, self.id, running)
+                running = {entry.job_id: entry.executor for entry in engine.running()}
+                requeue_jobs_of_dead_workers(engine, leases, self.id, running)
                 for job_id, trainer in trainers:
                     if running.get(job_id) != self.id and not trainer.stopping:
-                        LOG.warning("job %s is no longer ours: stopping its trainer", job_id)
+                        LOG.warning("job %s was cancelled or given to another worker: stopping its trainer", job_id)
                         trainer.stop()
             except JobError as error:
-                # The database may be away for a while; training goes on meanwhile, and the next round asks again.
-                LOG.warning("a round of worker %s is put off: %s", self.id, error)
+                # Training goes on while the database does not answer; the next round tries again.
+                LOG.warning("worker %s cannot check its jobs: %s", self.id, error)
             except Exception:
-                # Nobody foresaw it, but it is no reason to give up a training either.
-                LOG.exception("a round of worker %s failed", self.id)
+                # An unexpected error here must not end the trainings.
+                LOG.exception("worker %s failed to check its jobs", self.id)
             if stop.wait(ROUND_S):
                 return
 
     def _stop_all(self) -> None:
-        self._leaving = True
+        self._stopping = True
         for trainer in list(self._trainers.values()):
             trainer.stop()
         deadline = time.monotonic() + GRACE_S + 5.0
@@ -108,9 +107,9 @@ class Worker:
             time.sleep(0.05)
 
     async def _work(self, job_id: str) -> Outcome:
-        """Train a job to its end, starting over after a crash where that can help."""
+        """Train a job to its end, with another attempt after a crash if that can help."""
         folder = self._store.folder(job_id)
-        while not self._leaving:
+        while not self._stopping:
             reason = give_up_reason(folder.attempts(), folder.checkpoint() or 0)
             if reason is not None:
                 folder.close_attempts()
@@ -119,7 +118,7 @@ class Worker:
             LOG.info("job %s: attempt %d from iteration %d", job_id, attempt.number, attempt.checkpoint)
             trainer = TrainerChild(folder, self._threads)
             try:
-                ending = await self._owning(job_id, trainer)
+                ending = await self._run_trainer(job_id, trainer)
             except asyncio.CancelledError:
                 folder.end_attempt(attempt, ExitCode.STOPPED)
                 raise
@@ -129,17 +128,17 @@ class Worker:
             if outcome is not None:
                 folder.close_attempts()
                 return outcome
-            if trainer.stopping and not self._leaving:
+            if trainer.stopping and not self._stopping:
                 raise JobError(f"Job {job_id} was taken from worker {self.id}.")
-        # What becomes of the job is for the next worker to say.
+        # The worker is stopping: its job goes back to the queue, without an outcome.
         await asyncio.Event().wait()
         raise AssertionError("unreachable: only cancellation ends the wait")
 
-    async def _owning(self, job_id: str, trainer: TrainerChild) -> ProcessExit:
-        """Run a trainer where `_rounds` finds it."""
+    async def _run_trainer(self, job_id: str, trainer: TrainerChild) -> ProcessExit:
+        """Run a trainer, registered so that `_supervise` can stop it."""
         earlier = self._trainers.get(job_id)
         if earlier is not None:
-            # Cancelled and resumed before we noticed; the new child waits for the old one's lock on the folder.
+            # The job was cancelled and resumed between two rounds; the new child waits for the old one's file lock.
             earlier.stop()
         self._trainers[job_id] = trainer
         try:
@@ -149,15 +148,18 @@ class Worker:
                 del self._trainers[job_id]
 
 
-def reap(engine: Engine, leases: Leases, own: str, running: dict[str, str | None]) -> None:
-    """Put the jobs of workers that are dead back in the queue. Any number of workers may do so at once."""
-    for executor in sorted({other for other in running.values() if other is not None and other != own}):
-        if not leases.take_from_the_dead(executor):
-            continue  # alive, or somebody else is at it
+def requeue_jobs_of_dead_workers(engine: Engine, leases: Leases, own: str, running: dict[str, str | None]) -> None:
+    """Put the jobs of dead workers back in the queue. Any number of workers may call this at once.
+
+    `own` is the id of this worker, `running` the worker of each running job.
+    """
+    for executor in sorted({worker for worker in running.values() if worker is not None and worker != own}):
+        if not leases.acquire_from_dead(executor):
+            continue  # alive, or another worker requeues its jobs
         try:
-            lost = [ticket.job_id for ticket in engine.running() if ticket.executor == executor]
-            LOG.warning("worker %s is gone: back in the queue: %s", executor, ", ".join(lost) or "nothing")
-            engine.requeue(lost)
+            job_ids = [entry.job_id for entry in engine.running() if entry.executor == executor]
+            LOG.warning("worker %s died: back in the queue: %s", executor, ", ".join(job_ids) or "nothing")
+            engine.requeue(job_ids)
         finally:
             leases.release(executor)
 
@@ -165,7 +167,7 @@ def reap(engine: Engine, leases: Leases, own: str, running: dict[str, str | None
 def _end_process() -> NoReturn:
     """End with code 0, without waiting for threads.
 
-    DBOS has threads that ask again until the database answers, which nothing stops, and Python waits for them.
+    DBOS has threads that retry until the database answers and cannot be stopped, and Python would wait for them.
     """
     logging.shutdown()
     sys.stdout.flush()
@@ -174,7 +176,7 @@ def _end_process() -> NoReturn:
 
 
 def _outcome(ending: ProcessExit) -> Outcome | None:
-    """What an ending means for the job; None when another attempt may help."""
+    """The outcome of the job after its trainer ended; None if another attempt may help."""
     match ending.code:
         case ExitCode.DONE:
             return Outcome(JobState.SUCCEEDED)
@@ -186,22 +188,22 @@ def _outcome(ending: ProcessExit) -> Outcome | None:
 
 
 def give_up_reason(attempts: list[Attempt], checkpoint: int) -> str | None:
-    """Why another attempt would be in vain: too many of the last ones ended badly without getting any further."""
+    """Why the job has failed: too many of its last attempts ended without a new checkpoint. None: try again."""
     crashes: list[Attempt] = []
-    losses = 0
+    worker_deaths = 0
     for attempt in reversed(attempts):
         if attempt.final or attempt.checkpoint != checkpoint:
             break
         if attempt.exit_code is None:
-            losses += 1
+            worker_deaths += 1
         elif attempt.exit_code != ExitCode.STOPPED:
             crashes.append(attempt)
     if len(crashes) >= MAX_CRASHES:
         return _crash_message(crashes[0], len(crashes))
-    if losses >= MAX_LOSSES:
+    if worker_deaths >= MAX_WORKER_DEATHS:
         return (
-            f"The worker died {losses} times with this job at iteration {checkpoint}. Look at the machine's memory "
-            "and at the log, then retry."
+            f"The worker died {worker_deaths} times with this job at iteration {checkpoint}. Check the machine's "
+            "memory and the log, then retry."
         )
     return None
 

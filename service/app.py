@@ -1,4 +1,4 @@
-"""The application: routes, errors and what they work with, put together."""
+"""The application: routes, middleware, error handlers and their context."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=lifespan,
     )
     app.add_middleware(BodyLimit, limit=limit)
-    app.add_middleware(SameOrigin, names=settings.answers_to)
+    app.add_middleware(SameOrigin, allowed_hosts=settings.allowed_host_names)
     problems.install(app)
     for routes in (jobs, results, render, system):
         app.include_router(routes.router)

@@ -1,4 +1,4 @@
-"""BodyLimit: refuse request bodies that are too large, whether they say so or not. Knows nothing of what they hold."""
+"""BodyLimit: refuse request bodies that are too large, with or without a Content-Length."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.problems import TooLarge, problem
 
 
 class BodyLimit:
-    """Middleware: `limit(method, path)` is the most bytes that such a request may carry."""
+    """Middleware: `limit(method, path)` is the greatest number of bytes in the body of such a request."""
 
     def __init__(self, app: ASGIApp, limit: Callable[[str, str], int]) -> None:
         self._app = app
@@ -29,13 +29,13 @@ class BodyLimit:
             response = problem(request, 413, message, kind="too-large", headers=TooLarge.headers)
             await response(scope, receive, send)
             return
-        taken = 0
+        received = 0
 
         async def counted() -> Message:
-            nonlocal taken
+            nonlocal received
             part = await receive()
-            taken += len(part.get("body", b""))
-            if taken > most:
+            received += len(part.get("body", b""))
+            if received > most:
                 raise TooLarge(message)
             return part
 

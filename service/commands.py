@@ -1,4 +1,4 @@
-"""The command `serve`; also `python -m service.commands`. Knows nothing of what is served."""
+"""The command `serve`; also `python -m service.commands`."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from service.app import create_app
 from service.settings import Settings
 from service.worker_child import WorkerChild
 
-# Open event streams do not end by themselves.
-GRACEFUL_S = 3
+GRACEFUL_S = 3  # for open requests; event streams do not end by themselves
 
 
 def serve(
@@ -33,8 +32,12 @@ def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on (GRAINGS_HOST, 127.0.0.1).")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on (GRAINGS_PORT, 8000).")] = None,
     with_worker: Annotated[bool, typer.Option("--with-worker", help="Start a worker beside the service.")] = False,
-    threads: Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads of that worker's job (all).")] = None,
-    exit_with_parent: Annotated[bool, typer.Option("--exit-with-parent", help="End when standard input ends.")] = False,
+    threads: Annotated[
+        int | None, typer.Option(min=1, max=256, help="CPU threads of that worker's job (all cores).")
+    ] = None,
+    exit_with_parent: Annotated[
+        bool, typer.Option("--exit-with-parent", help="Stop when standard input ends.")
+    ] = False,
 ) -> None:
     """Serve the REST interface and its page until interrupted."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
@@ -44,7 +47,7 @@ def serve(
         typer.echo(f"serve: {error}", err=True)
         raise typer.Exit(2) from error
     try:
-        # Opened once before there is a server: within one, what is wrong would be said as a traceback.
+        # Opened once before the server starts, which would report an error as a traceback.
         Store(settings.data)
         Engine(settings.database_url).close()
     except (OSError, JobError) as error:
@@ -61,15 +64,14 @@ def serve(
         )
     )
 
-    def leave() -> None:
+    def stop() -> None:
         server.should_exit = True
 
-    # The server answers signals itself and raises them once more when it has ended; what is left to do then must not
-    # be cut short by that.
+    # uvicorn handles signals and raises them again after it has ended; that must not interrupt the end of the worker.
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: leave())
+        signal.signal(number, lambda *_: stop())
     if exit_with_parent:
-        watch_parent(leave)
+        watch_parent(stop)
     with ExitStack() as stack:
         if with_worker:
             stack.enter_context(WorkerChild(settings, threads))

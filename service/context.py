@@ -1,4 +1,4 @@
-"""Context: what the routes of one API process work with. Knows nothing of routes."""
+"""Context: the store, queue, models and settings that the routes of one API process share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jobs.lease import Leases, open_leases
 from jobs.queue import JobQueue
 from jobs.store import Store, discard_leftovers
 from service.archives import Limits
-from service.scenes import RenderPool, Scenes
+from service.rendering import ModelCache, RenderPool
 from service.settings import Settings
 
 MB = 1_000_000
@@ -28,12 +28,12 @@ class Context:
     engine: Engine
     jobs: JobQueue
     leases: Leases
-    scenes: Scenes
+    models: ModelCache
     pool: RenderPool
 
     @property
     def limits(self) -> Limits:
-        """What an upload may unpack to."""
+        """Limits of an unpacked upload."""
         return Limits(self.settings.max_files, self.settings.max_unpacked_mb * MB)
 
     def free_mb(self) -> int:
@@ -46,27 +46,27 @@ class Context:
 
 
 def open_context(settings: Settings) -> Context:
-    """Open the store and the database and pick up what an earlier process left half done."""
+    """Open store and database, remove abandoned uploads, and enqueue jobs that an earlier process only stored."""
     store = Store(settings.data)
     discard_leftovers(store.uploads)
     engine = Engine(settings.database_url)
     jobs = JobQueue(store, engine)
-    jobs.enqueue_orphans()
+    jobs.enqueue_stored_jobs()
     return Context(
         settings=settings,
         store=store,
         engine=engine,
         jobs=jobs,
         leases=open_leases(settings.database_url, store.workers),
-        scenes=Scenes(settings.models),
+        models=ModelCache(settings.models),
         pool=RenderPool(settings.render_slots, settings.render_waiting),
     )
 
 
-def _of(request: Request) -> Context:
+def _context_of(request: Request) -> Context:
     context: Context = request.app.state.context
     return context
 
 
-ContextDep = Annotated[Context, Depends(_of)]
+ContextDep = Annotated[Context, Depends(_context_of)]
 JobId = Annotated[str, Path(description="Id of a job.", examples=["019a2b3c4d5e8f01"], max_length=64)]

@@ -1,8 +1,7 @@
-"""The command `demo`: the whole way once, over HTTP, on a small scene that needs no download.
+"""The command `demo`: train a small synthetic scene over HTTP and fetch views of it.
 
-Starts service and worker as `graings serve --with-worker` does, writes the built-in moving capture, sends it, watches
-it train, and fetches views and numbers. A client like any other: it knows the service by its addresses and the names of
-its states.
+It starts the service and a worker as `graings serve --with-worker` does, writes the synthetic capture, submits it,
+shows the progress of training, and fetches views and metrics. It uses the REST interface like any other client.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from graings.capture.synthetic import write_synthetic
 from jobs.job import JobState
 
-# A minute or so of training on two cores.
+# About a minute of training on two cores.
 PRESET = "draft"
 OPTIONS: dict[str, Any] = {"iterations": 800, "init.points": 4_000, "density.max_anchors": 800}
 CAPTURE: dict[str, int] = {"frames": 80, "size": 128, "bodies": 3}
@@ -51,16 +50,16 @@ POLL_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Api:
-    """A REST client in a few lines. `url` has no slash at its end."""
+    """A minimal REST client. `url` has no slash at its end."""
 
     url: str
 
     def fetch(self, path: str, body: bytes | None = None, kind: str = "application/json") -> bytes:
-        """The body of an answer: to a POST when a `body` is sent, else to a GET. Raises `DemoError`."""
+        """The body of the response to a POST of `body`, or to a GET without a body. Raises `DemoError`."""
         request = urllib.request.Request(self.url + path, data=body, headers={"Content-Type": kind})
         try:
-            with urllib.request.urlopen(request, timeout=120) as answer:
-                content: bytes = answer.read()
+            with urllib.request.urlopen(request, timeout=120) as response:
+                content: bytes = response.read()
                 return content
         except urllib.error.HTTPError as error:
             problem = json.loads(error.read())
@@ -71,14 +70,14 @@ class Api:
 
 
 class DemoError(Exception):
-    """The demo cannot go on."""
+    """The demo cannot continue."""
 
 
 def demo(
-    once: Annotated[bool, typer.Option("--once", help="Exit when the views are there.")] = False,
-    folder: Annotated[Path, typer.Option(help="Where data, views and metrics go.")] = Path("data/demo"),
+    once: Annotated[bool, typer.Option("--once", help="Exit when the views are written.")] = False,
+    folder: Annotated[Path, typer.Option(help="Folder for data, views and metrics.")] = Path("data/demo"),
 ) -> None:
-    """Train a small moving scene through the service and look at it."""
+    """Train a small moving scene through the service and show it."""
     console = Console()
     started = time.monotonic()
     serving = False
@@ -88,13 +87,15 @@ def demo(
             job = _train(api, folder, console)
             metrics = _fetch(api, job, folder, console)
             console.print(f"Held-out PSNR [bold]{metrics['splits']['val']['psnr']:.2f} dB[/] (validation views)")
-            console.print(f"All of it took {time.monotonic() - started:.0f} s.")
+            console.print(f"Total time {time.monotonic() - started:.0f} s.")
             if not once:
-                console.print(f"Serving at [bold]{api.url}[/] — drag the scene, move the time. Ctrl-C ends it.")
+                console.print(
+                    f"Serving at [bold]{api.url}[/] — drag to orbit, move the time slider. Press Ctrl-C to stop."
+                )
                 serving = True
                 threading.Event().wait()
     except KeyboardInterrupt:
-        # An end that was asked for: the children are gone by now. Only before the views is it a failure.
+        # The child processes have ended. It is a failure only if the views are not written yet.
         raise typer.Exit(0 if serving else 130) from None
     except DemoError as error:
         console.print(f"[red]demo:[/] {error}")
@@ -102,12 +103,12 @@ def demo(
 
 
 def _train(api: Api, folder: Path, console: Console) -> str:
-    """Send the capture and watch the job to its end; returns its id."""
+    """Submit the capture and wait for the end of the job; returns its id."""
     capture = folder / "capture"
     if not capture.exists():
-        begun = folder / "capture.part"  # so that one cut short is not taken for whole
-        shutil.rmtree(begun, ignore_errors=True)
-        write_synthetic(begun, **CAPTURE).rename(capture)
+        part = folder / "capture.part"  # renamed when complete, so that a partial capture is not used
+        shutil.rmtree(part, ignore_errors=True)
+        write_synthetic(part, **CAPTURE).rename(capture)
     console.print(f"Capture: {capture} ({CAPTURE['frames']} frames of {CAPTURE['size']} px)")
     query = urlencode({"preset": PRESET, "name": "synthetic scene", "config": json.dumps(OPTIONS)})
     job = api.json(f"/jobs?{query}", _zipped(capture), "application/zip")
@@ -116,50 +117,50 @@ def _train(api: Api, folder: Path, console: Console) -> str:
         TextColumn("{task.fields[phase]:>8}"),
         BarColumn(),
         TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TextColumn("{task.fields[facts]}"),
+        TextColumn("{task.fields[details]}"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        bar = progress.add_task("train", total=OPTIONS["iterations"], phase="waiting", facts="")
+        bar = progress.add_task("train", total=OPTIONS["iterations"], phase="waiting", details="")
         while not JobState(job["state"]).final:
             time.sleep(POLL_S)
             job = api.json(job["links"]["self"])
             report = job["progress"]
             if report:
-                facts = ""
+                details = ""
                 if report["psnr"] is not None:
-                    facts = f"{report['psnr']:.1f} dB · {report['gaussians']} Gaussians"
-                progress.update(bar, completed=report["iteration"], phase=report["phase"], facts=facts)
+                    details = f"{report['psnr']:.1f} dB · {report['gaussians']} Gaussians"
+                progress.update(bar, completed=report["iteration"], phase=report["phase"], details=details)
     if job["state"] != JobState.SUCCEEDED:
         raise DemoError(f"the job has {job['state']}: {job['error']}. Its log: {api.url}{job['links']['log']}")
     return str(job["id"])
 
 
 def _fetch(api: Api, job: str, folder: Path, console: Console) -> dict[str, Any]:
-    """Views from several places and times into `folder`, and the metrics; returns those."""
+    """Fetch views from several viewpoints and times, and the metrics, into `folder`. Returns the metrics."""
     views = folder / "views"
     views.mkdir(parents=True, exist_ok=True)
     for name, viewpoint in VIEWPOINTS.items():
         for t in TIMES:
-            picture = api.fetch("/render?" + urlencode({"job": job, "t": t, "format": "png", **viewpoint}))
-            (views / f"{name}_t{t:.2f}.png").write_bytes(picture)
+            image = api.fetch("/render?" + urlencode({"job": job, "t": t, "format": "png", **viewpoint}))
+            (views / f"{name}_t{t:.2f}.png").write_bytes(image)
     metrics: dict[str, Any] = api.json(f"/jobs/{job}/metrics")
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
     (folder / "curve.svg").write_bytes(api.fetch(f"/jobs/{job}/curve.svg"))
     console.print(f"Views:   {views} ({len(VIEWPOINTS) * len(TIMES)} files)")
-    console.print(f"Numbers: {folder / 'metrics.json'}, {folder / 'curve.svg'}")
+    console.print(f"Metrics: {folder / 'metrics.json'}, {folder / 'curve.svg'}")
     return metrics
 
 
 @contextmanager
 def _service(data: Path, log: Path) -> Iterator[Api]:
-    """Service and worker as child processes, ended with the context."""
+    """Service and worker as child processes, which end with the context."""
     data.mkdir(parents=True, exist_ok=True)
     port = _free_port()
     command = [sys.executable, "-m", "service.commands", "--with-worker", "--exit-with-parent"]
     command += ["--data", str(data), "--port", str(port)]
     with log.open("ab") as output:
-        # In a session of its own: a Ctrl-C is ours to pass on.
+        # In its own session: a Ctrl-C reaches only this process, which then stops the children.
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=output, start_new_session=True)
     try:
         api = Api(f"http://127.0.0.1:{port}")
@@ -185,7 +186,7 @@ def _wait_until_ready(api: Api, child: subprocess.Popen[bytes], log: Path) -> No
 
 
 def _free_port() -> int:
-    """The usual port, or any other where that is taken."""
+    """`PREFERRED_PORT`, or any free port if it is in use."""
     for port in (PREFERRED_PORT, 0):
         with socket.socket() as probe:
             try:

@@ -1,7 +1,7 @@
-"""Inspection: whether training could begin on an unpacked capture.
+"""Inspection: check that training can start on an unpacked capture.
 
-Files of strangers go through readers of images and of COLMAP models that are not ours. They run in a process beside
-the service, which a crash or a shortage of memory there does not reach. Knows nothing of requests.
+Third-party libraries decode uploaded images and COLMAP models. They run in a separate process, so that a crash or lack
+of memory there does not end the service.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from graings.config import CaptureConfig
 from graings.errors import CaptureError
 from jobs.store import capture_root
 
-_Complaint = tuple[str, str, str | None, str]  # problem, file, field, remedy
+_Defect = tuple[str, str, str | None, str]  # problem, file, field, remedy
 
 
 async def inspect_capture(folder: Path, config: CaptureConfig) -> None:
-    """Raises `CaptureError` where training could not begin on the unpacked capture; files by their place in it."""
+    """Raise `CaptureError` if training cannot start on the unpacked capture; it names files by their path in it."""
     try:
-        complaint = await to_process.run_sync(_complaint, folder, config, cancellable=True)
+        defect = await to_process.run_sync(_find_defect, folder, config, cancellable=True)
     except BrokenWorkerProcess as error:
         raise CaptureError(
-            "reading it ended the process that did",
+            "reading it ended the reading process",
             file="the archive",
-            remedy="Open its images, and its COLMAP model where it has one, with the programs they come from, and save"
-            " again what those cannot read.",
+            remedy="Open its images, and its COLMAP model if it has one, in the programs that wrote them, and save"
+            " again the files that cannot be read.",
         ) from error
-    if complaint is not None:
-        problem, file, field, remedy = complaint
+    if defect is not None:
+        problem, file, field, remedy = defect
         raise CaptureError(problem, file=file, field=field, remedy=remedy)
 
 
-def _complaint(folder: Path, config: CaptureConfig) -> _Complaint | None:
+def _find_defect(folder: Path, config: CaptureConfig) -> _Defect | None:
     root = capture_root(folder)
 
-    def as_sent(text: str) -> str:
+    def relative(text: str) -> str:
         return text.replace(f"{root}/", "").replace(str(root), "the archive")
 
     try:
         load_capture(root, config)
-    except CaptureError as error:  # in parts: it takes its arguments by name, which pickle does not
-        return as_sent(error.problem), as_sent(error.file), error.field, as_sent(error.remedy)
+    except CaptureError as error:  # as a tuple: pickle cannot restore its keyword arguments
+        return relative(error.problem), relative(error.file), error.field, relative(error.remedy)
     return None

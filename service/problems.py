@@ -1,7 +1,4 @@
-"""Problems: every error of the service as a problem document (RFC 9457).
-
-One table says which error has which status. Knows nothing of what went wrong.
-"""
+"""Problems: every error of the service as a problem document (RFC 9457), with one table of errors and statuses."""
 
 from __future__ import annotations
 
@@ -28,18 +25,18 @@ _TYPES = "urn:graings:problem:"
 
 
 class Problem(BaseModel):
-    """A problem document; `type` is about:blank where the status says it all."""
+    """A problem document; `type` is about:blank if there is no more specific type than the status."""
 
     type: str = "about:blank"
     title: str
     status: int
     detail: str | None = None
     instance: str | None = None
-    errors: list[dict[str, Any]] | None = Field(None, description="What is wrong with which parameter.")
+    errors: list[dict[str, Any]] | None = Field(None, description="The wrong parameters and what is wrong with each.")
 
 
 class ServiceError(Exception):
-    """Root of what only the service knows to be wrong."""
+    """Base class of the errors of the service itself."""
 
     headers: ClassVar[dict[str, str] | None] = None
 
@@ -49,30 +46,30 @@ class BadRequest(ServiceError):
 
 
 class ArchiveError(ServiceError):
-    """An upload is not an archive that may be unpacked here."""
+    """An upload is not an archive, or not one that is safe to unpack."""
 
 
 class TooLarge(ServiceError):
-    """A body is larger than the service takes."""
+    """A body is larger than the limit."""
 
-    headers: ClassVar[dict[str, str] | None] = {"Connection": "close"}  # the rest of the body will not be read
+    headers: ClassVar[dict[str, str] | None] = {"Connection": "close"}  # the rest of the body is not read
 
 
 class NotYet(ServiceError):
-    """A thing that a job will have later."""
+    """A result that the job does not have yet."""
 
 
 class NotAcceptable(ServiceError):
-    """No format on offer is one that the client takes."""
+    """The service has no format that the client accepts."""
 
 
 class Busy(ServiceError):
-    """Too many wait already."""
+    """Too many requests wait already."""
 
     headers: ClassVar[dict[str, str] | None] = {"Retry-After": "1"}
 
 
-# The first class that fits counts.
+# The first matching class counts.
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (JobNotFound, 404, "no-such-job"),
     (JobConflict, 409, "state-conflict"),
@@ -92,22 +89,21 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (GraingsError, 500, "graings"),
 )
 
-# What is away for a while may be asked for again after some seconds.
-AWAY = {"Retry-After": "5"}
+RETRY_LATER = {"Retry-After": "5"}
 
-# What to say where a framework says no more than the status.
-_REMEDIES = {
-    404: "There is nothing at this address. /docs lists every address there is.",
-    405: "This address does not take that method; the header Allow names those it takes.",
+# Details for errors of the framework that have none.
+_DETAILS = {
+    404: "There is nothing at this address. /docs lists all addresses.",
+    405: "This address does not accept the method; the header Allow lists the methods that it accepts.",
 }
 
 RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {
-        "description": "What is wrong with the request",
+        "description": "An error in the request",
         "content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}},
     },
     "5XX": {
-        "description": "What is wrong with the service",
+        "description": "An error in the service",
         "content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}},
     },
 }
@@ -132,12 +128,12 @@ def problem(
         errors=errors,
     )
     text = json.dumps(document.model_dump(exclude_none=True), ensure_ascii=False, allow_nan=False)
-    # What the client sent may hold halves of characters, as "\\ud800" in JSON; to quote them must not fail.
+    # A request may contain half of a surrogate pair, as "\\ud800" in JSON, which UTF-8 cannot encode.
     return Response(text.encode("utf-8", "replace"), status, media_type=MEDIA_TYPE, headers=headers)
 
 
 def install(app: FastAPI) -> None:
-    """Have every error of `app` answered with a problem document."""
+    """Make `app` answer every error with a problem document."""
 
     async def known(request: Request, error: Exception) -> Response:
         status, kind = next((status, kind) for cls, status, kind in STATUSES if isinstance(error, cls))
@@ -145,13 +141,13 @@ def install(app: FastAPI) -> None:
             LOG.error("%s %s: %s", request.method, request.url.path, error)
         headers = error.headers if isinstance(error, ServiceError) else None
         if status == 503 and headers is None:
-            headers = AWAY
+            headers = RETRY_LATER
         return problem(request, status, str(error), kind=kind, headers=headers)
 
     async def http(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         phrase = HTTPStatus(error.status_code).phrase
-        detail = _REMEDIES.get(error.status_code) if error.detail == phrase else str(error.detail)
+        detail = _DETAILS.get(error.status_code) if error.detail == phrase else str(error.detail)
         return problem(request, error.status_code, detail, headers=dict(error.headers) if error.headers else None)
 
     async def validation(request: Request, error: Exception) -> Response:
@@ -164,24 +160,24 @@ def install(app: FastAPI) -> None:
     async def disk(request: Request, error: Exception) -> Response:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return problem(request, 507, "The disk of the service is full.", kind="disk-full")
-        return await unforeseen(request, error)
+        return await unexpected(request, error)
 
-    async def unforeseen(request: Request, error: Exception) -> Response:
+    async def unexpected(request: Request, error: Exception) -> Response:
         LOG.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return problem(request, 500, "The service made a mistake; its log has the details.")
+        return problem(request, 500, "An unexpected error in the service; its log has the details.")
 
     for cls, _, _ in STATUSES:
         app.add_exception_handler(cls, known)
     app.add_exception_handler(HTTPException, http)
     app.add_exception_handler(RequestValidationError, validation)
     app.add_exception_handler(OSError, disk)
-    # Starlette puts its own catch-all outside of everything and raises again after answering; a server then drops
-    # the connection. One inside answers and is done.
-    app.add_middleware(_CatchAll, answer=unforeseen)
+    # Starlette's own handler for all errors raises the error again after its response, and a server then drops the
+    # connection. This one does not.
+    app.add_middleware(_CatchAll, answer=unexpected)
 
 
 class _CatchAll:
-    """Answers whatever nobody foresaw, as long as no response has begun."""
+    """Middleware that answers unexpected errors as long as no response has started."""
 
     def __init__(self, app: Any, answer: Any) -> None:
         self._app = app
@@ -191,17 +187,17 @@ class _CatchAll:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        begun = False
+        started = False
 
         async def watched(message: Any) -> None:
-            nonlocal begun
-            begun = begun or message["type"] == "http.response.start"
+            nonlocal started
+            started = started or message["type"] == "http.response.start"
             await send(message)
 
         try:
             await self._app(scope, receive, watched)
         except Exception as error:
-            if begun:
+            if started:
                 raise
             response = await self._answer(Request(scope, receive), error)
             await response(scope, receive, send)

@@ -1,9 +1,9 @@
-"""SameOrigin: refuse what a page of somebody else has a browser send.
+"""SameOrigin: refuse requests that a page of another site makes a browser send.
 
-A browser sends a request to a service on its own machine for any page that asks, and says in `Origin` whose page it
-was; scripts say nothing. A page may also have its own name lead to this machine (DNS rebinding), and is then of the
-same origin by that name; the browser says so in `Host`. Without authentication these two are all that keeps strange
-pages from reading, starting and deleting jobs. Knows nothing of what is asked.
+A page of any site can make a browser send requests to a service on its own machine; the header `Origin` names that
+site, and scripts send none. A site can also resolve its own name to this machine (DNS rebinding), so that its page is
+of the same origin; the header `Host` then has that name. The service has no authentication: these two checks prevent
+such pages from reading, starting and deleting jobs.
 """
 
 from __future__ import annotations
@@ -17,49 +17,49 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.problems import problem
 
-HARMLESS = ("GET", "HEAD", "OPTIONS")  # change nothing, and what they answer such a page never gets to see
-ANY = "*"
+SAFE_METHODS = ("GET", "HEAD", "OPTIONS")  # they change nothing, and a page of another site cannot read the response
+ANY_HOST = "*"
 
 
 class SameOrigin:
-    """Middleware: all is asked of a name of this service, and what changes something by a page of it or by none.
+    """Middleware: `Host` must be an allowed host, and for a method that changes something `Origin` must be that host.
 
-    `names` are those it answers to, beside addresses, which nobody else can have lead here; `ANY` stands for all.
+    `allowed_hosts` are names; IP addresses are always allowed, as DNS cannot redirect them. `ANY_HOST` allows all.
     """
 
-    def __init__(self, app: ASGIApp, names: Collection[str]) -> None:
+    def __init__(self, app: ASGIApp, allowed_hosts: Collection[str]) -> None:
         self._app = app
-        self._names = names
+        self._allowed_hosts = allowed_hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
             request = Request(scope)
             origin, host = request.headers.get("origin"), request.headers.get("host")
-            if host is not None and not self._is_ours(host):
+            if host is not None and not self._is_allowed(host):
                 detail = (
-                    f"This service does not answer to the name {host[:80]!r}. "
-                    "If it should, add the name to its setting GRAINGS_NAMES."
+                    f"{host[:80]!r} is not an allowed host of this service. "
+                    "If it should be, add it to the setting GRAINGS_ALLOWED_HOSTS."
                 )
-                await problem(request, 403, detail, kind="foreign-name")(scope, receive, send)
+                await problem(request, 403, detail, kind="host-not-allowed")(scope, receive, send)
                 return
             if (
-                request.method not in HARMLESS
+                request.method not in SAFE_METHODS
                 and origin is not None
                 and (host is None or urlsplit(origin).netloc.lower() != host.lower())
             ):
-                detail = "A page of another site asked for this. Behind a proxy, have it pass on the header Host."
-                await problem(request, 403, detail, kind="foreign-page")(scope, receive, send)
+                detail = "A page of another site sent this request. A proxy must pass on the header Host unchanged."
+                await problem(request, 403, detail, kind="cross-origin")(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 
-    def _is_ours(self, host: str) -> bool:
-        if ANY in self._names:
+    def _is_allowed(self, host: str) -> bool:
+        if ANY_HOST in self._allowed_hosts:
             return True
         try:
             name = urlsplit(f"//{host}").hostname or ""
-        except ValueError:  # brackets around what is no address
+        except ValueError:  # brackets without an IP address in them
             return False
-        return name in self._names or _is_address(name)
+        return name in self._allowed_hosts or _is_address(name)
 
 
 def _is_address(name: str) -> bool:

@@ -1,7 +1,4 @@
-"""Settings: what an operator may choose about the service.
-
-Every field can be given as an environment variable `GRAINGS_<FIELD>`. Knows nothing of how they are used.
-"""
+"""Settings of the service. Every field can be set by an environment variable `GRAINGS_<FIELD>`."""
 
 from __future__ import annotations
 
@@ -25,34 +22,36 @@ class Settings(BaseModel):
     data: Path = Field(Path("data"), description="Folder with captures and jobs.")
     database: str | None = Field(None, description="sqlite:///… or postgresql://…; null: SQLite in the data folder.")
     host: str = Field("127.0.0.1", description="Address to listen on. There is no authentication: keep it local.")
-    names: str = Field(
+    allowed_hosts: str = Field(
         "localhost",
-        description="Names by which it may be asked for, beside addresses, with commas between them; * for any. "
-        "Others may belong to a page that leads its own name here.",
+        description="Host names of the service, besides IP addresses, separated by commas; * for any. Others are "
+        "refused: a page of another site can resolve its own name to this machine.",
     )
     port: int = Field(8000, ge=0, le=65535, description="Port to listen on.")
-    max_upload_mb: int = Field(4_096, ge=1, description="Largest archive that is accepted.")
-    max_unpacked_mb: int = Field(16_384, ge=1, description="Largest capture that an archive may unpack to.")
-    max_files: int = Field(20_000, ge=1, description="Most files in an archive.")
-    min_free_mb: int = Field(512, ge=0, description="Free disk space below which the service is not ready.")
-    models: int = Field(4, ge=1, le=256, description="Loaded models that are kept in memory.")
+    max_upload_mb: int = Field(4_096, ge=1, description="Largest accepted archive, in MB.")
+    max_unpacked_mb: int = Field(16_384, ge=1, description="Largest capture after unpacking, in MB.")
+    max_files: int = Field(20_000, ge=1, description="Greatest number of files in an archive.")
+    min_free_mb: int = Field(512, ge=0, description="Free disk space, in MB, below which the service is not ready.")
+    models: int = Field(4, ge=1, le=256, description="Greatest number of models in memory.")
     render_slots: int = Field(1, ge=1, le=64, description="Images rendered at the same time.")
-    render_waiting: int = Field(16, ge=0, le=1_000, description="Requests that may wait for a slot; more get 503.")
+    render_waiting: int = Field(
+        16, ge=0, le=1_000, description="Requests that may wait for a slot; further ones get 503."
+    )
     render_threads: int = Field(1, ge=1, le=256, description="CPU threads per image.")
 
     @property
     def database_url(self) -> str:
-        """The database, the default filled in."""
+        """The URL of the database, which is in the data folder by default."""
         return self.database or default_database(self.data)
 
     @property
-    def answers_to(self) -> frozenset[str]:
-        """`names`, one by one, in small letters."""
-        return frozenset(name.strip().lower() for name in self.names.split(","))
+    def allowed_host_names(self) -> frozenset[str]:
+        """The names in `allowed_hosts`, in lower case."""
+        return frozenset(name.strip().lower() for name in self.allowed_hosts.split(","))
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ, **given: object) -> Settings:
-        """Settings from the environment; what is `given` and not None wins. Raises `ConfigError`."""
+        """Settings from the environment, overridden by those in `given` that are not None. Raises `ConfigError`."""
         values: dict[str, object] = {
             name: environment[PREFIX + name.upper()]
             for name in cls.model_fields

@@ -1,7 +1,6 @@
 """Uploads: from a request body to an unpacked capture.
 
-The body is written to disk as it arrives, hashed on the way, and unpacked beside it; nothing stays behind when
-anything goes wrong. Knows nothing of what becomes of it.
+The body is hashed while it is written to disk, and unpacked beside it. After an error nothing remains.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """A capture that arrived: where it was unpacked, the archive's sha256, and the options sent along with it."""
+    """An unpacked capture: its folder, the SHA-256 of the archive, and the options from the form."""
 
     folder: Path
     digest: str
@@ -38,11 +37,11 @@ class Upload:
 
 @asynccontextmanager
 async def receive_capture(request: Request, uploads: Path, limits: Limits) -> AsyncIterator[Upload]:
-    """The capture in a request's body, which is an archive or a multipart form with one.
+    """The capture in the body of a request, which is an archive or a multipart form with one.
 
-    `folder` lasts as long as the context unless it is moved away. Raises `ArchiveError` and `BadRequest`.
+    `folder` is removed with the context unless it was moved. Raises `ArchiveError` and `BadRequest`.
     """
-    # Here too, not only at the start: what a crash left may fill the disk that this upload needs.
+    # Not only at the start of the service: files of a process that died may fill the disk that this upload needs.
     await to_thread.run_sync(discard_leftovers, uploads)
     name = uuid.uuid4().hex
     archive, folder = uploads / f"{name}.part", uploads / name
@@ -62,7 +61,7 @@ async def receive_capture(request: Request, uploads: Path, limits: Limits) -> As
 
 
 def parse_config(text: str, where: str) -> dict[str, Any]:
-    """A JSON object of options. Raises `BadRequest` naming `where` it was given."""
+    """Parse a JSON object of options. Raises `BadRequest` naming the parameter `where`."""
     try:
         value = json.loads(text, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:

@@ -1,6 +1,6 @@
-"""WorkerChild: a worker process beside the service, for one machine without further ado.
+"""WorkerChild: a worker process beside the service, for use on one machine.
 
-Started again when it dies, brought to an end with us. Knows nothing of what it does.
+It is restarted when it dies, and stopped with the service.
 """
 
 from __future__ import annotations
@@ -19,58 +19,58 @@ LOG = logging.getLogger(__name__)
 
 RESTART_AFTER_S = 2.0
 
-USAGE = 2  # exit code of a command that was given what it does not take
+USAGE = 2  # exit code of a command with wrong arguments
 
 
 class WorkerChild:
-    """A context in which a worker runs."""
+    """A context during which a worker process runs."""
 
     def __init__(self, settings: Settings, threads: int | None) -> None:
         self._command = [sys.executable, "-m", "jobs.commands", "--exit-with-parent"]
         self._command += ["--data", str(settings.data)]
-        # Not as an argument: those of a process are everybody's to read, and a password may be in it.
+        # Not as an argument, which every user can read: the URL may contain a password.
         self._environment = {**os.environ, "GRAINGS_DATABASE": settings.database_url}
         if threads is not None:
             self._command += ["--threads", str(threads)]
-        self._leave = threading.Event()
+        self._stopping = threading.Event()
         self._guard = threading.Lock()
         self._process = self._start()
-        self._keeper = threading.Thread(target=self._keep, name="worker-keeper")
+        self._supervisor = threading.Thread(target=self._supervise, name="worker-supervisor")
 
     def _start(self) -> subprocess.Popen[bytes]:
-        # It ends when its standard input does, so also when we are killed; its own session keeps a Ctrl-C in the
-        # terminal ours to pass on.
+        # It stops when its standard input ends, so also when this process is killed. In its own session a Ctrl-C in the
+        # terminal reaches only this process, which then stops the worker.
         return subprocess.Popen(self._command, stdin=subprocess.PIPE, start_new_session=True, env=self._environment)
 
-    def _keep(self) -> None:
+    def _supervise(self) -> None:
         while True:
             code = self._process.wait()
             assert self._process.stdin is not None
             self._process.stdin.close()
-            if self._leave.wait(RESTART_AFTER_S):
+            if self._stopping.wait(RESTART_AFTER_S):
                 return
             with self._guard:
-                if self._leave.is_set():
+                if self._stopping.is_set():
                     return
                 if code == USAGE:
-                    LOG.error("the worker refuses how it was started; jobs wait until the service is started otherwise")
+                    LOG.error("the worker refuses its arguments and is not restarted; restart the service with others")
                     return
-                LOG.error("the worker ended with code %d and is started again", code)
+                LOG.error("the worker ended with code %d and is restarted", code)
                 self._process = self._start()
 
     def __enter__(self) -> WorkerChild:
-        self._keeper.start()
+        self._supervisor.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with self._guard:
-            self._leave.set()
+            self._stopping.set()
             self._process.terminate()
         try:
             self._process.wait(GRACE_S + 15.0)
         except subprocess.TimeoutExpired:
-            LOG.error("the worker does not end and is killed")
+            LOG.error("the worker does not stop and is killed")
             self._process.kill()
-        self._keeper.join()
+        self._supervisor.join()

@@ -62,7 +62,10 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.render", "graings.report", "graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
-    "jobs": ("graings.config", "graings.report.events", "graings.storage.run_folder"),
+    "jobs": (
+        *("graings.config", "graings.document", "graings.report.events", "graings.storage.files"),
+        "graings.storage.run_folder",
+    ),
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
     # HTTP never trains.
     "service": (
@@ -77,6 +80,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "fastapi": ("service",),
     "starlette": ("service",),
     "uvicorn": ("service",),
+    "werkzeug": ("service.routes.render",),
     "typer": ("graings.cli.main", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
     "rich": (
         *("graings.cli.main", "graings.cli.training", "graings.cli.progress", "graings.cli.terminal", "jobs.commands"),
@@ -219,7 +223,7 @@ def test_a_module_says_what_it_is() -> None:
 
 def test_no_module_is_longer_than_300_lines() -> None:
     lengths = {name: len(path.read_text().splitlines()) for name, path in MODULES.items()}
-    assert {name: length for name, length in lengths.items() if length > 420} == {}
+    assert {name: length for name, length in lengths.items() if length > 300} == {}
 
 
 def test_a_class_name_exists_once() -> None:

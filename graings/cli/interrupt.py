@@ -1,10 +1,6 @@
-"""Interrupt: Ctrl-C as a question that a loop asks between two steps.
+"""Interrupt: the first Ctrl-C is only recorded, so that a loop can stop between two steps; the second ends the process.
 
-A step that is cut in half cannot be resumed bit for bit, so the first signal only waits to be noticed; a second
-one ends the process at once. Knows nothing of training.
-
-The answer to a signal goes past all buffers: it may have come in the middle of a print, and printing within printing is
-an error that would end what was only to be paused.
+A step that is cut in half could not be resumed bit for bit.
 """
 
 from __future__ import annotations
@@ -21,11 +17,11 @@ STDERR = 2
 
 
 class Interrupt:
-    """A context in the main thread; `received` is the first signal that came, or None. It is answered by `answer`."""
+    """A context in the main thread; `received` is the first signal, or None. It is confirmed with `message`."""
 
-    def __init__(self, answer: str) -> None:
+    def __init__(self, message: str) -> None:
         self.received: int | None = None
-        self._answer = f"\n{answer}\n".encode()
+        self._message = f"\n{message}\n".encode()
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupt:
@@ -39,14 +35,16 @@ class Interrupt:
 
     @property
     def exit_code(self) -> int:
-        """What a shell calls a process that ended by this signal."""
+        """The exit code of a process that this signal ended."""
         return 128 + (self.received or 0)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = number
         self._restore()
-        with contextlib.suppress(OSError):  # Ctrl-C ends the `tee` behind us too: who is not heard still stops in order
-            os.write(STDERR, self._answer)
+        # Without buffers: the signal may interrupt a print, and a print within a print raises an error. If Ctrl-C also
+        # ended a `tee` that reads our output, the write fails, and training still stops at a checkpoint.
+        with contextlib.suppress(OSError):
+            os.write(STDERR, self._message)
 
     def _restore(self) -> None:
         while self._before:

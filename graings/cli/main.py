@@ -1,32 +1,31 @@
-"""The command line: one verb per thing a person wants done.
+"""The command line: its commands, and errors as one line and an exit code.
 
-Reads arguments, calls the library, prints, and turns errors into one line and an exit code. The verbs that train are in
-`graings.cli.training`. Verbs that need jobs or HTTP live in those packages and join through the entry-point group
-`graings.commands`; this module does not know their names.
+The commands that train are in `graings.cli.training`. Commands that need jobs or HTTP are in those packages, found by
+the entry-point group `graings.commands`.
 """
 
 from __future__ import annotations
 
 import errno
 import json
-import math
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from time import perf_counter
 from typing import Annotated, Any, Final, Literal, NoReturn, get_args
 
 import typer
 import typer.core
+from annotated_types import Ge, Gt, Le, Lt  # pydantic depends on it
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from graings.camera.camera import Camera
-from graings.camera.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
-from graings.cli.terminal import metrics_line, say
-from graings.cli.training import Lists, Threads, ablate, train
+from graings.camera.view_request import MAX_SIDE, ViewRequest
+from graings.camera.viewpoint import background_rgb
+from graings.cli.terminal import metrics_line, print_line
+from graings.cli.training import MultiValueCommand, Threads, ablate, train
 from graings.config import ConfigSection, make_config, options
 from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
 from graings.image_encoding import encode_image, image_format
@@ -36,50 +35,52 @@ from graings.report.evaluate_run import evaluate_run
 from graings.report.folder import report_runs
 from graings.report.work_precision import summary
 from graings.storage.compact import SUFFIX, open_model, write_compact
-from graings.storage.model import Model, scene_bytes
+from graings.storage.model import scene_bytes
 
-MISSING: Final = 69
-LONGEST_SIDE: Final = 16384  # of a picture, in pixels
+UNAVAILABLE: Final = 69  # after sysexits.h, as the others
 EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (
     (ConfigError, 2),
     (CaptureError, 65),
     (CheckpointError, 65),
-    (KernelError, MISSING),
+    (KernelError, UNAVAILABLE),
     (DivergedError, 70),
     (OSError, 74),
 )
+OTHER_PATH: Final = "Choose another path."
 REMEDIES: Final[dict[int | None, str]] = {
     errno.ENOENT: "Check the path.",
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Free some space there; training goes on with --resume."),
-    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "Name another place, or have this one opened to you."),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Free some space there; training continues with --resume."),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "Choose another path, or get permission for this one."),
 }
 EPILOG: Final = (
     "Exit codes: 0 done; 1 a bug; 2 wrong usage or option; 65 the capture or checkpoint cannot be used; 69 the kernel "
     "or a package is missing; 70 training diverged; 74 a file cannot be read or written; 130 interrupted (143 by "
-    "SIGTERM), for training with a checkpoint to resume from."
+    "SIGTERM); an interrupted training leaves a checkpoint to resume from."
 )
 
-Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
-Shown = Annotated[
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
+ModelPath = Annotated[
     Path, typer.Argument(metavar="RUN", help="Folder of a run, one of its checkpoints, or an exported .graings file.")
 ]
 
 
-class Verbs(typer.core.TyperGroup):
-    """The verbs below and those of other installed packages, which are loaded when they are used."""
+class Commands(typer.core.TyperGroup):
+    """The commands below and those of other installed packages, which are imported when they are used."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Names in the order of the help page."""
+        """Names, in the order of the help page."""
         return [*super().list_commands(ctx), *sorted(entry_points(group="graings.commands").names)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of that name, or None."""
         for entry in entry_points(group="graings.commands", name=cmd_name):
-            return _joined(entry)
+            return _package_command(entry)
         return super().get_command(ctx, cmd_name)
 
 
-app = typer.Typer(cls=Verbs, no_args_is_help=True, add_completion=False, epilog=EPILOG, pretty_exceptions_enable=False)
+app = typer.Typer(
+    cls=Commands, no_args_is_help=True, add_completion=False, epilog=EPILOG, pretty_exceptions_enable=False
+)
 
 
 @app.callback()
@@ -88,97 +89,100 @@ def graings() -> None:
 
 
 app.command()(train)
-app.command(cls=Lists)(ablate)
+app.command(cls=MultiValueCommand)(ablate)
 
 
 @app.command(name="render")
 def render_view(
-    run: Shown,
+    run: ModelPath,
     output: Annotated[Path, typer.Option("--output", "-o", help="Image file: .png, .jpg, .webp or .exr.")],
-    t: Annotated[float | None, typer.Option(help="Time from 0 to 1; left out: that of --camera, or 0.")] = None,
+    t: Annotated[float | None, typer.Option(help="Time from 0 to 1 (default: that of --camera, or 0).")] = None,
     camera: Annotated[str | None, typer.Option(help="A view of the capture, such as test:3.")] = None,
-    azimuth: Annotated[float | None, typer.Option(help="Degrees about the vertical axis.")] = None,
-    elevation: Annotated[float | None, typer.Option(help="Degrees above the horizon.")] = None,
-    radius: Annotated[float | None, typer.Option(help="Distance to the target in the capture's units.")] = None,
+    azimuth: Annotated[float | None, typer.Option(help="Degrees about the vertical axis (default: 0).")] = None,
+    elevation: Annotated[
+        float | None, typer.Option(help="Degrees above the horizon (default: median of the training views).")
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option(help="Distance to the target in the capture's units (default: median).")
+    ] = None,
     target: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="What to look at, in the capture's units."),
+        typer.Option(metavar="X Y Z", help="Point to look at, in the capture's units (default: the centre)."),
     ] = None,
     fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
     pose: Annotated[
-        Path | None, typer.Option(help="JSON: world_to_camera (4x4, OpenCV axes), fx, fy, cx, cy, width, height.")
+        Path | None,
+        typer.Option(help="JSON: world_to_camera (4x4, OpenCV axes), fx, width, height; optional: fy, cx, cy."),
     ] = None,
-    width: Annotated[int | None, typer.Option(min=1, max=LONGEST_SIDE, help="Pixels.")] = None,
-    height: Annotated[int | None, typer.Option(min=1, max=LONGEST_SIDE, help="Pixels.")] = None,
+    width: Annotated[int | None, typer.Option(min=1, max=MAX_SIDE, help="Pixels.")] = None,
+    height: Annotated[int | None, typer.Option(min=1, max=MAX_SIDE, help="Pixels.")] = None,
     background: Annotated[
-        str | None, typer.Option(help="white, black, #rrggbb or r,g,b; left out: as trained.")
+        str | None, typer.Option(help="white, black, #rrggbb or r,g,b (default: as in training).")
     ] = None,
     threads: Threads = None,
 ) -> None:
-    """Draw one view at one time; without a camera, an orbit at the height of the training views."""
+    """Render one view at one time; without --camera or --pose, an orbit around the scene."""
     use_threads(threads)
-    orbit = any(value is not None for value in (azimuth, elevation, radius, target, fov))
-    if (camera is not None) + (pose is not None) + orbit > 1:
-        raise typer.BadParameter("choose one of --camera, --pose and an orbit (--azimuth, --elevation, ...)")
-    if t is not None and not math.isfinite(t):
-        raise typer.BadParameter(f"time must be a number from 0 to 1, got {t}", param_hint="--t")
     try:
         format = image_format(output.suffix)
-        rgb = background_rgb(background) if background is not None else None
+        request = ViewRequest(
+            camera=camera,
+            azimuth=azimuth,
+            elevation=elevation,
+            radius=radius,
+            target=target,
+            fov=fov,
+            pose=None if pose is None else _read_pose(pose),
+            width=width,
+            height=height,
+            t=t,
+            background=background,
+        )
         model = open_model(run)
-        if camera is not None:
-            named = named_view(model.views, camera)
-            view, own_time = sized(named.camera, width, height), named.time
-        elif pose is not None:
-            view, own_time = sized(_read_pose(pose, model), width, height), 0.0
-        else:
-            around = model.views["train"]
-            view = orbit_view(around, model.units, azimuth, elevation, radius, target, fov, width, height)
-            own_time = 0.0
+        view, time, rgb = request.resolve(model.views, model.units, model.background)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    moment = own_time if t is None else min(max(t, 0.0), 1.0)
-    if t is not None and moment != t:
-        say(f"Time {t:g} lies outside the capture; drawn at {moment:g}.")
-    started = time.perf_counter()
-    result = render(model.scene, view, moment, rgb or model.background)
-    milliseconds = 1e3 * (time.perf_counter() - started)
+    if t is not None and time != t:
+        print_line(f"Time {t:g} is outside the capture; rendered at {time:g}.")
+    started = perf_counter()
+    result = render(model.scene, view, time, rgb)
+    milliseconds = 1e3 * (perf_counter() - started)
     output.write_bytes(encode_image(result.color.numpy(), format))
-    say(f"{output}: {view.width} x {view.height} at t = {moment:g}, drawn in {milliseconds:.0f} ms.")
+    print_line(f"{output}: {view.width} x {view.height} at t = {time:g}, rendered in {milliseconds:.0f} ms.")
 
 
 @app.command()
 def export(
-    run: Shown,
+    run: ModelPath,
     output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write, such as scene{SUFFIX}.")],
 ) -> None:
-    """Write a model as one small file that `graings render` takes in place of the run."""
+    """Write a model as one small file that `graings render` accepts in place of a run."""
     model = open_model(run)
     size = write_compact(model, output)
-    say(f"{output}: {size / 1e6:.2f} MB, {scene_bytes(model.scene) / 1e6:.2f} MB in float32.")
+    print_line(f"{output}: {size / 1e6:.2f} MB, {scene_bytes(model.scene) / 1e6:.2f} MB in float32.")
 
 
 @app.command()
 def evaluate(
-    run: Run,
-    split: Annotated[Literal["val", "test"], typer.Option(help="Held-out views to measure.")] = "val",
-    capture: Annotated[Path | None, typer.Option(help="Where the capture lies now, if it moved.")] = None,
+    run: RunFolder,
+    split: Annotated[Literal["val", "test"], typer.Option(help="Held-out views to evaluate.")] = "val",
+    capture: Annotated[Path | None, typer.Option(help="Folder of the capture, if it was moved since training.")] = None,
     background: Annotated[
-        str | None, typer.Option(help="white, black, #rrggbb or r,g,b instead of training's; only told, not written.")
+        str | None, typer.Option(help="white, black, #rrggbb or r,g,b instead of that of training; prints only.")
     ] = None,
     threads: Threads = None,
 ) -> None:
-    """Measure a trained model on held-out views and add the numbers to its metrics.json."""
+    """Evaluate a trained model on held-out views and add the metrics to its metrics.json."""
     use_threads(threads)
     try:
         rgb = background_rgb(background) if background is not None else None
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--background") from error
-    say(metrics_line(split, evaluate_run(run, split, capture, rgb)))
+    print_line(metrics_line(split, evaluate_run(run, split, capture, rgb)))
     if rgb is None:
-        say(f"Written to {run / 'metrics.json'}.")
+        print_line(f"Written to {run / 'metrics.json'}.")
     else:
-        say(f"On {background}; metrics.json keeps the numbers on the background of training.")
+        print_line(f"On {background}; metrics.json still has the metrics on the background of training.")
 
 
 @app.command()
@@ -186,7 +190,7 @@ def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or their metrics.json.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the report.")],
     render: Annotated[
-        bool, typer.Option("--render/--no-render", help="Draw the models too: picture error against milliseconds.")
+        bool, typer.Option("--render/--no-render", help="Render the models too: image error against milliseconds.")
     ] = True,
     threads: Threads = None,
 ) -> None:
@@ -197,12 +201,12 @@ def report(
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="RUN") from error
     for part in written.document.training:
-        say(summary(part))
+        print_line(summary(part))
         for problem in part.phases.problems:
-            say(f"{part.run.name}: {problem}")
+            print_line(f"{part.run.name}: {problem}")
     for note in written.notes:
-        say(note)
-    say(f"Written to {written.folder}: {', '.join(written.files)}.")
+        print_line(note)
+    print_line(f"Written to {written.folder}: {', '.join(written.files)}.")
 
 
 @app.command(name="options")
@@ -210,7 +214,7 @@ def show_options(
     preset: Annotated[str, typer.Option(help="Show the values of this preset.")] = "standard",
     as_json: Annotated[bool, typer.Option("--json", help="JSON schema and presets instead of a table.")] = False,
 ) -> None:
-    """List every option that --set understands."""
+    """List every option of --set."""
     console = Console()
     if as_json:
         console.print_json(json.dumps(options()))
@@ -226,54 +230,47 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         app(args=arguments, prog_name="graings")
     except (GraingsError, OSError) as error:
-        _fail(_words(error), next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1))
+        _fail(_message(error), next((code for kind, code in EXIT_CODES if isinstance(error, kind)), 1))
 
 
-def _words(error: Exception) -> str:
-    """What happened to which file, and what to do, instead of the system's number for it."""
+def _message(error: Exception) -> str:
+    """File, cause and remedy of an error, without the system's error number."""
     if isinstance(error, FileExistsError | NotADirectoryError):
-        place = Path(str(error.filename))
-        taken = next((one for one in (place, *place.parents) if one.is_file()), place)
-        return f"{taken}: is a file where a folder is wanted. Name another place."
+        path = Path(str(error.filename))
+        file = next((parent for parent in (path, *path.parents) if parent.is_file()), path)
+        return f"{file}: is a file where a folder is needed. {OTHER_PATH}"
     if isinstance(error, OSError) and error.strerror:
-        file = "" if error.filename is None else f"{error.filename}: "  # a full disk is told of without its file
-        return f"{file}{error.strerror}. {REMEDIES.get(error.errno, 'Name another place.')}"
+        name = "" if error.filename is None else f"{error.filename}: "  # a full disk is reported without its file
+        return f"{name}{error.strerror}. {REMEDIES.get(error.errno, OTHER_PATH)}"
     return str(error)
 
 
-def _joined(entry: EntryPoint) -> Any:
-    """The command of an entry point; where it cannot be loaded, one that says why when it is used."""
-    one = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+def _package_command(entry: EntryPoint) -> Any:
+    """The command of an entry point; if it cannot be imported, one that fails with the reason when it is used."""
+    group = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     try:
-        one.command(entry.name)(entry.load())
+        group.command(entry.name)(entry.load())
     except ImportError as error:
         reason = str(error)
+        remedy = " Install what is missing." if isinstance(error, ModuleNotFoundError) else ""
 
-        def missing() -> None:
-            _fail(f"graings {entry.name} is not available here: {reason}. Install what is missing.", MISSING)
+        def unavailable() -> None:
+            _fail(f"graings {entry.name} is not available: {reason}.{remedy}", UNAVAILABLE)
 
-        anything = {"ignore_unknown_options": True, "allow_extra_args": True}
-        one.command(entry.name, help=f"(not available: {reason})", context_settings=anything)(missing)
-    return typer.main.get_command(one)
+        any_arguments = {"ignore_unknown_options": True, "allow_extra_args": True}
+        group.command(entry.name, help=f"(not available: {reason})", context_settings=any_arguments)(unavailable)
+    return typer.main.get_command(group)
 
 
-def _read_pose(file: Path, model: Model) -> Camera:
-    """The camera in a pose file; `ValueError` naming the key that is missing or wrong."""
+def _read_pose(file: Path) -> dict[str, object]:
+    """The values of a pose file. Raises `ValueError`."""
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
+        pose = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not JSON ({error})") from error
-    keys = ("world_to_camera", "fx", "fy", "cx", "cy", "width", "height")
-    absent = [key for key in keys if key not in document] if isinstance(document, dict) else list(keys)
-    if absent:
-        raise ValueError(f"{file}: {', '.join(absent)} missing; a pose needs {', '.join(keys)}")
-    for key in ("width", "height"):
-        if type(document[key]) is not int or not 1 <= document[key] <= LONGEST_SIDE:
-            raise ValueError(f"{file}: {key} must be a whole number from 1 to {LONGEST_SIDE}, got {document[key]!r}")
-    try:
-        return pose_camera(model.units, *(document[key] for key in keys))
-    except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(f"{file}: {error}") from error
+    if not isinstance(pose, dict):
+        raise ValueError(f"{file}: must be a JSON object with world_to_camera, fx, width and height")
+    return pose
 
 
 def _fields(part: ConfigSection, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
@@ -283,11 +280,24 @@ def _fields(part: ConfigSection, prefix: str = "") -> Iterator[tuple[str, str, s
         if isinstance(value, ConfigSection):
             yield from _fields(value, f"{prefix}{name}.")
             continue
-        signs = (("ge", "≥"), ("gt", ">"), ("le", "≤"), ("lt", "<"))
+        # Bounds of the value itself, or of each item of a list.
         items = [info for item in get_args(field.annotation)[:1] for info in getattr(item, "__metadata__", ())]
-        limits = [*field.metadata, *(limit for info in items for limit in info.metadata)]  # its own, or of each item
-        bounds = [f"{sign} {getattr(m, key)}" for m in limits for key, sign in signs if hasattr(m, key)]
+        metadata = [*field.metadata, *(constraint for info in items for constraint in info.metadata)]
+        bounds = [text for constraint in metadata if (text := _bound(constraint))]
         yield f"{prefix}{name}", json.dumps(value), ", ".join(bounds), field.description or ""
+
+
+def _bound(constraint: object) -> str:
+    match constraint:
+        case Ge(ge=limit):
+            return f"≥ {limit}"
+        case Gt(gt=limit):
+            return f"> {limit}"
+        case Le(le=limit):
+            return f"≤ {limit}"
+        case Lt(lt=limit):
+            return f"< {limit}"
+    return ""
 
 
 def _fail(text: str, code: int) -> NoReturn:

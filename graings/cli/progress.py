@@ -1,8 +1,4 @@
-"""Progress: a training run as a person at a terminal sees it.
-
-A bar with speed, quality and time left on a terminal, one line per evaluation elsewhere. Knows how to show a
-step, not how to take one.
-"""
+"""Progress of a training run: on a terminal a bar with speed, PSNR and time left, elsewhere a line per evaluation."""
 
 from __future__ import annotations
 
@@ -17,7 +13,7 @@ from graings.training.run_output import RunReport
 
 
 class _TimeLeft(ProgressColumn):
-    """Remaining iterations at the run's own speed, which stands still during evaluations."""
+    """Remaining iterations at the run's speed, in which evaluations do not count."""
 
     max_refresh = 0.5
 
@@ -63,7 +59,7 @@ class TrainingProgress:
         self._bar.stop()
 
     def show(self, step: RunReport) -> None:
-        """Move the bar to `step`; evaluations and events stay on the screen as lines."""
+        """Move the bar to `step`; print its evaluation and events as lines."""
         self._bar.update(
             self._task,
             description=step.phase,
@@ -80,7 +76,7 @@ class TrainingProgress:
             self._line(f"{event.iteration:>7,}  {event.message}")
 
     def note(self, text: str) -> None:
-        """A line above the bar."""
+        """Print a line above the bar."""
         self._line(text)
 
     def _line(self, text: str) -> None:

@@ -1,7 +1,4 @@
-"""Terminal: lines for a person to read.
-
-Knows nothing of arguments, exit codes or progress bars.
-"""
+"""Terminal: lines of text for people."""
 
 from __future__ import annotations
 
@@ -12,14 +9,14 @@ from rich.text import Text
 from graings.evaluation.metrics import SplitMetrics
 
 
-def say(words: str) -> None:
-    """Print a line as it is: no markup, no wrapping."""
-    Console().print(Text(words), soft_wrap=True)
+def print_line(text: str) -> None:
+    """Print a line without markup and wrapping."""
+    Console().print(Text(text), soft_wrap=True)
 
 
-def waiting(words: str) -> Status:
-    """A context that shows `words` on a terminal, and that something is at work; nothing elsewhere."""
-    return Console().status(Text(words, style="dim"))
+def busy_status(text: str) -> Status:
+    """A context that shows `text` and a spinner on a terminal; nothing elsewhere."""
+    return Console().status(Text(text, style="dim"))
 
 
 def metrics_line(split: str, metrics: SplitMetrics) -> str:

@@ -1,8 +1,4 @@
-"""The verbs that train: one run, or the runs of an ablation.
-
-Functions that `graings.cli.main` makes commands of. Knows nothing of the other verbs, and of exit codes only that of an
-interruption.
-"""
+"""The commands that train: one run, or the runs of an ablation. `graings.cli.main` registers them."""
 
 from __future__ import annotations
 
@@ -20,26 +16,25 @@ from graings.ablation.rows import ROWS
 from graings.ablation.table import signed
 from graings.cli.interrupt import Interrupt
 from graings.cli.progress import TrainingProgress
-from graings.cli.terminal import metrics_line, say, waiting
+from graings.cli.terminal import busy_status, metrics_line, print_line
 from graings.config import PRESETS, make_config
 from graings.report.metrics_document import read_metrics
 from graings.training.run import TrainingRun
 
-Threads = Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads; left out: all cores.")]
+Threads = Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads (default: all cores).")]
 Preset = Annotated[str | None, typer.Option(help=f"Where defaults come from: {', '.join(PRESETS)}.")]
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any option of `graings options`.")
 ]
 
-# Options that take several values after one name.
-LISTS: Final = ("--rows", "--seeds")
+MULTI_VALUE: Final = ("--rows", "--seeds")
 
 
-class Lists(typer.core.TyperCommand):
-    """A command whose `LISTS` are given as `--seeds 0 1 2`, up to the next option."""
+class MultiValueCommand(typer.core.TyperCommand):
+    """A command whose options `MULTI_VALUE` take all values up to the next option, as in `--seeds 0 1 2`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Repeats the name before every value, which is how the parser below knows lists."""
+        """Repeats the option before each value, which is the form that click parses."""
         return super().parse_args(ctx, _repeated(args))
 
 
@@ -55,28 +50,28 @@ def train(
     if resume:
         if preset is not None or settings:
             raise typer.BadParameter("a resumed run keeps its options; leave out --preset and --set")
-        with waiting("reading the capture"):
+        with busy_status("reading the capture"):
             run = TrainingRun.resume(output, capture=capture, threads=threads)
     else:
         if capture is None:
-            raise typer.BadParameter("say which capture to train on", param_hint="CAPTURE")
+            raise typer.BadParameter("name the folder of the capture to train on", param_hint="CAPTURE")
         overrides = dict(_setting(text) for text in settings or ())
         if preset is not None:
-            _once(preset, overrides)
+            _check_one_preset(preset, overrides)
             overrides["preset"] = preset
         if threads is not None:
             overrides["threads"] = threads
         config = make_config(overrides=overrides)
-        with waiting("reading the capture"):
+        with busy_status("reading the capture"):
             run = TrainingRun.create(capture, output, config)
     interrupt = _take_steps(run)
     if run.iteration < run.iterations:
-        say(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations; nothing is lost.")
-        say(f"Continue with: graings train --resume -o {run.folder}")
+        print_line(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations, at a checkpoint.")
+        print_line(f"Continue with: graings train --resume -o {run.folder}")
         raise typer.Exit(interrupt.exit_code)
-    _say_result(run)
-    say(f"The model, metrics.json, curve.svg and report/ are in {run.folder}.")
-    say(f"Look at it: graings render {run.folder} --t 0.5 -o view.png")
+    _print_result(run)
+    print_line(f"The model, metrics.json, curve.svg and report/ are in {run.folder}.")
+    print_line(f"Render a view: graings render {run.folder} --t 0.5 -o view.png")
 
 
 def ablate(
@@ -87,23 +82,23 @@ def ablate(
     preset: Preset = None,
     settings: Settings = None,
     seeds: Annotated[
-        list[int] | None, typer.Option(metavar="N ...", min=0, help="Seeds that every row gets; left out: 0 1 2.")
+        list[int] | None, typer.Option(metavar="N ...", min=0, help="Seeds of every row (default: 0 1 2).")
     ] = None,
     rows: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ROW ...", help=f"Some of {', '.join(row.name for row in ROWS)}; left out: all that differ."
+            metavar="ROW ...", help=f"Some of {', '.join(row.name for row in ROWS)} (default: all that differ)."
         ),
     ] = None,
     threads: Threads = None,
 ) -> None:
-    """Train the model and what is left of it without each of its parts, and compare them on validation views.
+    """Train the model and variants without one of its parts, and compare them on validation views.
 
-    The same command again continues where it stopped; more rows and seeds can be added later.
+    Run the same command again to continue; rows and seeds can be added later.
     """
     overrides = dict(_setting(text) for text in settings or ())
     if preset is not None:
-        _once(preset, overrides)
+        _check_one_preset(preset, overrides)
     named = str(overrides.pop("preset", "standard"))
     ablation = Ablation(
         *(output, capture),
@@ -114,36 +109,38 @@ def ablate(
         threads=threads,
     )
     for note in ablation.notes:
-        say(note)
+        print_line(note)
     left = len(ablation.pending())
-    say(f"{len(ablation.runs)} runs, {len(ablation.runs) - left} of them finished.")
+    print_line(f"{len(ablation.runs)} runs, {len(ablation.runs) - left} of them finished.")
     for job, run in ablation:
-        say(f"{job.row.label}, seed {job.seed}: {left} to go")
+        print_line(f"{job.row.label}, seed {job.seed}: {left} to go")
         interrupt = _take_steps(run)
         if run.iteration >= run.iterations:
-            _say_result(run)
+            _print_result(run)
             left -= 1
         if interrupt.received is not None and left:
             ablation.write()
-            say(f"Stopped with {left} runs left; nothing is lost. The same command again goes on.")
+            print_line(f"Stopped with {left} runs left. Run the same command again to continue.")
             raise typer.Exit(interrupt.exit_code)
     for row in ablation.write().rows:
         mean, difference = row.psnr.mean, row.difference.mean
         if mean is not None:
-            say(f"{row.label:>22}  {mean:.2f} dB" + (f"  {signed(difference)}" if difference is not None else ""))
-    say(f"The table is in {output / 'ablation.md'}, with ablation.json and ablation.svg beside it.")
+            print_line(
+                f"{row.label:>22}  {mean:.2f} dB" + (f"  {signed(difference)}" if difference is not None else "")
+            )
+    print_line(f"The table is in {output / 'ablation.md'}, with ablation.json and ablation.svg beside it.")
 
 
-def _once(preset: str, overrides: dict[str, Any]) -> None:
+def _check_one_preset(preset: str, overrides: dict[str, Any]) -> None:
     if overrides.get("preset", preset) != preset:
         raise typer.BadParameter(f"the preset is {preset} and {overrides['preset']}; give one of --preset and --set")
 
 
 def _take_steps(run: TrainingRun) -> Interrupt:
-    """Train to the end, or to a checkpoint where a signal asked to stop; returns who would have heard it."""
+    """Train to the end, or until a signal, and then save a checkpoint. Returns the interrupt."""
     with (
         TrainingProgress(Console(), run.iteration, run.iterations) as progress,
-        Interrupt("stopping after this step; once more to stop at once") as interrupt,
+        Interrupt("stopping after this step; press Ctrl-C again to stop at once") as interrupt,
     ):
         for note in run.capture.notes:
             progress.note(note)
@@ -155,13 +152,13 @@ def _take_steps(run: TrainingRun) -> Interrupt:
     return interrupt
 
 
-def _say_result(run: TrainingRun) -> None:
+def _print_result(run: TrainingRun) -> None:
     for split, metrics in read_metrics(run.metrics_path).splits.items():
-        say(metrics_line(split, metrics))
+        print_line(metrics_line(split, metrics))
 
 
 def _setting(text: str) -> tuple[str, Any]:
-    """`key=value` with the value as JSON, or as a string where it is none."""
+    """Key and value of `key=value`, the value as JSON if it is valid JSON, else as a string."""
     key, equals, value = text.partition("=")
     if not equals or not key:
         raise typer.BadParameter(f"must look like key=value, got {text!r}", param_hint="--set")
@@ -178,7 +175,7 @@ def _repeated(arguments: Sequence[str]) -> list[str]:
     for argument in arguments:
         if argument.startswith("-"):
             name = argument.partition("=")[0]
-        elif name in LISTS and result[-1] != name:
+        elif name in MULTI_VALUE and result[-1] != name:
             result.append(name)
         result.append(argument)
     return result

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from graings.camera.units import Units
 from graings.config import TrainConfig
 from graings.errors import CheckpointError
 from graings.scene.scene import Scene
+from graings.storage.files import sync_folder, sync_tree
 from graings.storage.model import Model, model_facts, model_from
 from graings.storage.run_folder import BEST, CHECKPOINTS, FACTS_FILE, checkpoints
 from graings.storage.run_folder import best_checkpoint as best_checkpoint  # part of this module's interface too
@@ -97,9 +97,7 @@ def save_checkpoint(
             "state": state.facts,
         }
         (part / FACTS_FILE).write_text(json.dumps(facts, allow_nan=False))
-        for file in part.iterdir():
-            _flush(file)
-        _flush(part)
+        sync_tree(part)
         old = folder / f".{name}.old"
         shutil.rmtree(old, ignore_errors=True)
         if final.exists():
@@ -107,7 +105,7 @@ def save_checkpoint(
             final.rename(old)
         part.rename(final)
         shutil.rmtree(old, ignore_errors=True)
-        _flush(folder)
+        sync_folder(folder)
     except (OSError, SafetensorError) as error:  # the library has its own for a full disk
         shutil.rmtree(part, ignore_errors=True)
         raise CheckpointError(
@@ -185,11 +183,3 @@ def _read_facts(folder: Path) -> dict[str, Any]:
 
 def _contiguous(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor.detach().contiguous().clone() for name, tensor in tensors.items()}
-
-
-def _flush(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
-import os
 import zlib
 from pathlib import Path
 from typing import Final
@@ -26,6 +25,7 @@ from graings.errors import CheckpointError
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.storage.checkpoint import load_model
+from graings.storage.files import write_bytes
 from graings.storage.model import Model, model_facts, model_from
 from graings.storage.run_folder import newest_model
 
@@ -71,12 +71,9 @@ def write_compact(model: Model, path: Path) -> int:
     packed = gzip.compress(data, mtime=0)
     if not path.name or path.is_dir():
         raise CheckpointError(f"{path}: is a folder where a file is wanted. Name a file in it.")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")  # two processes may write at once; the last one wins
     try:
-        part.write_bytes(packed)
-        part.replace(path)
+        write_bytes(path, packed)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise CheckpointError(f"{path}: cannot write the model ({error.strerror}). Name another place.") from error
     return len(packed)
 

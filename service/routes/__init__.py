@@ -1,1 +1,1 @@
-"""One module per kind of resource."""
+"""Routes of the service, one module per kind of resource."""

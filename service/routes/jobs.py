@@ -1,4 +1,4 @@
-"""Routes of jobs: submit, look, steer, remove. Decides nothing itself: `jobs.queue` does."""
+"""Routes of jobs: submit, list, get, cancel, resume, retry, delete. `jobs.queue` implements them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FORM = {
     "required": ["capture"],
     "properties": {
         "capture": {"type": "string", "format": "binary", "description": "A zip, tar or tar.gz of the capture."},
-        "config": {"type": "string", "description": "Options as a JSON object; they win over the query's."},
+        "config": {"type": "string", "description": "Options as a JSON object, which override those of the query."},
     },
 }
 _BODY: dict[str, Any] = {
@@ -46,25 +46,23 @@ RETRY_AFTER_S = "2"
 async def submit(
     request: Request,
     response: Response,
-    here: ContextDep,
-    preset: Annotated[str, Query(description=f"Where defaults come from: {', '.join(PRESETS)}.")] = "standard",
+    context: ContextDep,
+    preset: Annotated[str, Query(description=f"Source of default values: {', '.join(PRESETS)}.")] = "standard",
     config: Annotated[
         str | None, Query(description="Options as a JSON object, nested or with dotted keys, see /options.")
     ] = None,
     priority: Annotated[int, Query(ge=1, le=1_000_000, description="Jobs with a lower number start first.")] = 10,
-    name: Annotated[
-        str, Query(min_length=1, max_length=120, description="For people to recognise the job.")
-    ] = "untitled",
+    name: Annotated[str, Query(min_length=1, max_length=120, description="Name of the job, for people.")] = "untitled",
 ) -> JobResource:
-    """Queue a training job on the capture in the body, sent as it is or as `capture` of a multipart form."""
+    """Queue a training job on the capture in the body: an archive, or a multipart form with one as `capture`."""
     overrides = {} if config is None else parse_config(config, "config")
-    # Once before the body is read: nobody should upload gigabytes to hear of a typing mistake.
+    # Checked before the body is read, so that a typing error is reported before gigabytes are uploaded.
     make_config(preset, overrides)
-    async with receive_capture(request, here.store.uploads, here.limits) as upload:
+    async with receive_capture(request, context.store.uploads, context.limits) as upload:
         chosen = make_config(preset, {**overrides, **upload.config})
         await inspect_capture(upload.folder, chosen.capture)
         spec = JobSpec(name=name, capture=upload.digest, config=chosen.model_dump(mode="json"), priority=priority)
-        job = await to_thread.run_sync(here.jobs.submit, spec, upload.folder)
+        job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder)
     response.headers["Location"] = f"/jobs/{job.id}"
     response.headers["Retry-After"] = RETRY_AFTER_S
     return job_resource(job)
@@ -72,44 +70,44 @@ async def submit(
 
 @router.get("", operation_id="list_jobs")
 def page(
-    here: ContextDep,
+    context: ContextDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
-    cursor: Annotated[str | None, Query(pattern=ID_PATTERN, description="From `next` of the page before.")] = None,
+    cursor: Annotated[str | None, Query(pattern=ID_PATTERN, description="From `next` of the previous page.")] = None,
 ) -> JobPage:
     """Jobs, newest first."""
-    jobs, after = here.jobs.page(limit, cursor)
+    jobs, after = context.jobs.page(limit, cursor)
     following = None if after is None else "/jobs?" + urlencode({"limit": limit, "cursor": after})
     return JobPage(jobs=[job_resource(job) for job in jobs], next=following)
 
 
 @router.get("/{job_id}", operation_id="get_job")
-def get(job_id: JobId, response: Response, here: ContextDep) -> JobResource:
+def get(job_id: JobId, response: Response, context: ContextDep) -> JobResource:
     """A job with its state and progress."""
-    job = here.jobs.get(job_id)
+    job = context.jobs.get(job_id)
     if not job.state.final:
         response.headers["Retry-After"] = RETRY_AFTER_S
     return job_resource(job)
 
 
 @router.post("/{job_id}/cancel", status_code=202, operation_id="cancel_job")
-def cancel(job_id: JobId, here: ContextDep) -> JobResource:
-    """Stop a job; it keeps a checkpoint to resume from. Cancelling it again changes nothing."""
-    return job_resource(here.jobs.cancel(job_id))
+def cancel(job_id: JobId, context: ContextDep) -> JobResource:
+    """Stop a job at a checkpoint from which it can be resumed. Cancelling it again changes nothing."""
+    return job_resource(context.jobs.cancel(job_id))
 
 
 @router.post("/{job_id}/resume", status_code=202, operation_id="resume_job")
-def resume(job_id: JobId, here: ContextDep) -> JobResource:
+def resume(job_id: JobId, context: ContextDep) -> JobResource:
     """Queue a cancelled job again; it continues where it stopped. Resuming it again changes nothing."""
-    return job_resource(here.jobs.resume(job_id))
+    return job_resource(context.jobs.resume(job_id))
 
 
 @router.post("/{job_id}/retry", status_code=202, operation_id="retry_job")
-def retry(job_id: JobId, here: ContextDep) -> JobResource:
+def retry(job_id: JobId, context: ContextDep) -> JobResource:
     """Queue a failed or diverged job again; it continues from its last checkpoint, if any."""
-    return job_resource(here.jobs.retry(job_id))
+    return job_resource(context.jobs.retry(job_id))
 
 
 @router.delete("/{job_id}", status_code=204, operation_id="delete_job")
-def delete(job_id: JobId, here: ContextDep) -> None:
-    """Remove a job with its model, log and metrics; its capture too when no other job uses it."""
-    here.jobs.delete(job_id)
+def delete(job_id: JobId, context: ContextDep) -> None:
+    """Remove a job with its model, log and metrics, and its capture if no other job uses it."""
+    context.jobs.delete(job_id)

@@ -1,4 +1,4 @@
-"""The route of pictures: a model from any viewpoint at any time."""
+"""The route of images: a model rendered from any viewpoint at any time."""
 
 from __future__ import annotations
 
@@ -11,50 +11,53 @@ import numpy as np
 from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
+from werkzeug.datastructures import MIMEAccept
+from werkzeug.http import parse_accept_header
 
 import graings
-from graings.camera.camera import Camera, View
-from graings.camera.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
+from graings.camera.camera import Camera
+from graings.camera.units import Units
+from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.errors import CheckpointError
 from graings.image_encoding import FORMATS, MEDIA_TYPES, ImageFormat
 from graings.storage.model import Model
 from jobs.job import JobNotFound
 from service.context import Context, ContextDep
-from service.negotiation import preferred
 from service.problems import RESPONSES, BadRequest, NotAcceptable, NotYet
-from service.scenes import Picture
+from service.rendering import RenderRequest
 
 router = APIRouter(tags=["render"])
 
-MAX_SIDE = 4096
-_ORBIT = ("azimuth", "elevation", "radius", "target", "fov")
-_POSE = ("pose", "fx", "fy", "cx", "cy")
+_INTRINSICS = ("fx", "fy", "cx", "cy")
 _IMAGES: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The picture",
+        "description": "The image",
         "content": {media: {"schema": {"type": "string", "format": "binary"}} for media in MEDIA_TYPES.values()},
         "headers": {
             "ETag": {"schema": {"type": "string"}},
-            "X-Graings-Job": {"schema": {"type": "string"}, "description": "Whose model this is."},
-            "X-Graings-Iteration": {"schema": {"type": "integer"}, "description": "Of the checkpoint that was drawn."},
-            "X-Graings-Finished": {"schema": {"type": "boolean"}, "description": "false while training goes on."},
+            "X-Graings-Job": {"schema": {"type": "string"}, "description": "Job of the model."},
+            "X-Graings-Iteration": {"schema": {"type": "integer"}, "description": "Iteration of the checkpoint."},
+            "X-Graings-Finished": {"schema": {"type": "boolean"}, "description": "false while training continues."},
             "X-Graings-Orbit": {
                 "schema": {"type": "string"},
-                "description": "azimuth elevation radius, when orbiting.",
+                "description": "azimuth elevation radius of an orbit.",
             },
-            "X-Time-Clamped": {"schema": {"type": "number"}, "description": "The time drawn, if t was outside [0, 1]."},
+            "X-Time-Clamped": {
+                "schema": {"type": "number"},
+                "description": "The rendered time, if t was outside [0, 1].",
+            },
         },
     },
-    304: {"description": "The client has this picture"},
+    304: {"description": "The image has not changed"},
 }
 
 
 class RenderQuery(BaseModel):
-    """What to draw. The viewpoint is a view of the capture, an orbit, or a pose; by default an orbit."""
+    """Parameters of an image. The viewpoint is a view of the capture, an orbit, or a pose; by default an orbit."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    job: str | None = Field(None, max_length=64, description="Whose model; by default the newest job that has one.")
+    job: str | None = Field(None, max_length=64, description="Job of the model; by default the newest that has one.")
     t: float | None = Field(
         None, description="Time in [0, 1], clamped. Default: that of the view named by `camera`, else 0."
     )
@@ -79,7 +82,7 @@ class RenderQuery(BaseModel):
     fy: float | None = Field(None, gt=0, description="Pose: focal length in pixels (default fx).")
     cx: float | None = Field(None, description="Pose: principal point in pixels (default: the middle).")
     cy: float | None = Field(None, description="Pose: principal point in pixels (default: the middle).")
-    width: int | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels; with one length the shape is kept.")
+    width: int | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels; one alone keeps the aspect ratio.")
     height: int | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels.")
     background: str | None = Field(None, max_length=60, description="white, black, #rrggbb or r,g,b in [0, 1].")
     format: ImageFormat | None = Field(None, description="Instead of the Accept header.")
@@ -88,61 +91,58 @@ class RenderQuery(BaseModel):
 @router.get("/render", operation_id="render", response_class=Response, responses={**_IMAGES, **RESPONSES})
 async def render(
     query: Annotated[RenderQuery, Query()],
-    here: ContextDep,
+    context: ContextDep,
     accept: Annotated[str | None, Header()] = None,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
-    """A picture of the newest model, or of a job's newest checkpoint while it trains, at time `t` from a viewpoint."""
+    """Render the newest model, or a job's newest checkpoint while it trains, at time `t` from a viewpoint."""
     format = query.format or _format(accept)
-    job_id, model = await to_thread.run_sync(_model, here, query.job)
+    job_id, model = await to_thread.run_sync(_model, context, query.job)
     try:
-        camera, own_time = _viewpoint(model, query)
-        background = model.background if query.background is None else background_rgb(query.background)
+        view = _view_request(query)
+        camera, time, background = view.resolve(model.views, model.units, model.background)
     except ValueError as error:
         raise BadRequest(f"{error}.") from error
-    if max(camera.width, camera.height) > MAX_SIDE:
-        raise BadRequest(f"{camera.width}x{camera.height} is too large: at most {MAX_SIDE} pixels a side.")
-    asked = own_time if query.t is None else query.t
-    time = min(1.0, max(0.0, asked))
-    picture = Picture(camera, time, background, format)
+    request = RenderRequest(camera, time, background, format)
     headers = {
-        "ETag": _etag(model, picture),
+        "ETag": _etag(model, request),
         "Vary": "Accept",
-        # The newest checkpoint changes under the same address: ask again each time, which is cheap.
+        # The newest checkpoint changes under the same address: clients revalidate each time, which is cheap.
         "Cache-Control": "private, no-cache",
         "X-Graings-Job": job_id,
         "X-Graings-Iteration": str(model.iteration),
         "X-Graings-Finished": str(model.finished).lower(),
     }
-    if time != asked:
+    if query.t is not None and time != query.t:
         headers["X-Time-Clamped"] = f"{time:g}"
-    if query.camera is None and query.pose is None:
-        headers["X-Graings-Orbit"] = _orbit_header(model, query, camera)
+    if view.is_orbit:
+        headers["X-Graings-Orbit"] = _orbit_header(view, camera, model.units)
     if _matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    image = await here.pool.draw(model, picture)
+    image = await context.pool.render(model, request)
     return Response(image, media_type=MEDIA_TYPES[format], headers=headers)
 
 
 def _format(accept: str | None) -> ImageFormat:
-    media = preferred(accept, [MEDIA_TYPES[format] for format in FORMATS])
-    for format in FORMATS:
-        if MEDIA_TYPES[format] == media:
-            return format
-    raise NotAcceptable(f"On offer: {', '.join(MEDIA_TYPES.values())}.")
+    """The offered format that the Accept header prefers, the earlier of `FORMATS` if several are equal."""
+    offered = {MEDIA_TYPES[format]: format for format in FORMATS}
+    media_type = parse_accept_header(accept or "*/*", MIMEAccept).best_match(offered)
+    if media_type is None:
+        raise NotAcceptable(f"None of the accepted formats is available. Accept one of {', '.join(offered)}.")
+    return offered[media_type]
 
 
-def _model(here: Context, job_id: str | None) -> tuple[str, Model]:
+def _model(context: Context, job_id: str | None) -> tuple[str, Model]:
     """The model of a job, or of the newest job that has one. Blocks."""
     if job_id is not None:
-        model = here.scenes.load(here.store.folder(job_id).run)
+        model = context.models.load(context.store.folder(job_id).run)
         if model is None:
-            raise NotYet(f"Job {job_id} has no checkpoint yet. Try again when its resource has a render link.")
+            raise NotYet(f"Job {job_id} has no checkpoint yet. Try again when the job has a render link.")
         return job_id, model
     damaged: CheckpointError | None = None
-    for candidate in here.store.ids():
+    for candidate in context.store.ids():
         try:
-            model = here.scenes.load(here.store.folder(candidate).run)
+            model = context.models.load(context.store.folder(candidate).run)
         except JobNotFound:
             continue  # deleted meanwhile
         except CheckpointError as error:
@@ -155,59 +155,42 @@ def _model(here: Context, job_id: str | None) -> tuple[str, Model]:
     raise NotYet("There is no model yet. Submit a capture to /jobs.")
 
 
-def _viewpoint(model: Model, query: RenderQuery) -> tuple[Camera, float]:
-    """The camera that was asked for, normalised, and the time that goes with it. Raises `ValueError`."""
-    asked = {
-        kind: [name for name in names if getattr(query, name) is not None]
-        for kind, names in {"view": ("camera",), "orbit": _ORBIT, "pose": _POSE}.items()
-    }
-    kinds = [kind for kind, names in asked.items() if names]
-    if len(kinds) > 1:
-        named = ", ".join(name for names in asked.values() for name in names)
-        raise ValueError(f"one viewpoint at a time: a view, an orbit or a pose, not {named} together")
-    if query.camera is not None:
-        view = named_view(model.views, query.camera)
-        return sized(view.camera, query.width, query.height), view.time
-    if "pose" in kinds:
-        return _posed(model, query), 0.0
-    camera = orbit_view(
-        _reference_views(model),
-        model.units,
-        query.azimuth or 0.0,
-        query.elevation,
-        query.radius,
-        None if query.target is None else _numbers(query.target, "target", 3),
-        query.fov,
-        query.width,
-        query.height,
+def _view_request(query: RenderQuery) -> ViewRequest:
+    """The view of a query. Raises `ValueError` naming the parameter."""
+    pose: dict[str, object] = {name: value for name in _INTRINSICS if (value := getattr(query, name)) is not None}
+    if query.pose is not None:
+        pose["world_to_camera"] = _matrix(query.pose)
+    if pose:
+        pose |= {"width": query.width, "height": query.height}
+    return ViewRequest(
+        camera=query.camera,
+        azimuth=query.azimuth,
+        elevation=query.elevation,
+        radius=query.radius,
+        target=None if query.target is None else _numbers(query.target, "target", 3),
+        fov=query.fov,
+        pose=pose or None,
+        width=query.width,
+        height=query.height,
+        t=query.t,
+        background=query.background,
     )
-    return camera, 0.0
 
 
-def _orbit_header(model: Model, query: RenderQuery, camera: Camera) -> str:
-    """Azimuth, elevation and radius of the orbit drawn, so that a client who gave none can go on from there."""
-    target = model.units.center if query.target is None else _numbers(query.target, "target", 3)
-    arm = camera.center - model.units.points(target)
-    length = float(np.linalg.norm(arm))
-    elevation = math.degrees(math.asin(max(-1.0, min(1.0, float(arm @ np.asarray(model.units.up)) / length))))
-    return f"{query.azimuth or 0.0:g} {elevation:.6g} {length / model.units.scale:.6g}"
-
-
-def _reference_views(model: Model) -> tuple[View, ...]:
-    return model.views.get("train", ())
-
-
-def _posed(model: Model, query: RenderQuery) -> Camera:
-    if query.pose is None or query.fx is None or query.width is None or query.height is None:
-        raise ValueError("a pose needs pose, fx, width and height")
+def _matrix(text: str) -> object:
     try:
-        matrix = np.array(json.loads(query.pose), dtype=np.float64)
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"pose must be a JSON list of four rows of four numbers ({error})") from error
-    width, height = query.width, query.height
-    cx = width / 2 if query.cx is None else query.cx
-    cy = height / 2 if query.cy is None else query.cy
-    return pose_camera(model.units, matrix, query.fx, query.fy or query.fx, cx, cy, width, height)
+
+
+def _orbit_header(view: ViewRequest, camera: Camera, units: Units) -> str:
+    """Azimuth, elevation and radius of an orbit, so that a client that gave none can change them."""
+    target = units.center if view.target is None else view.target
+    arm = camera.center - units.points(target)
+    length = float(np.linalg.norm(arm))
+    elevation = math.degrees(math.asin(max(-1.0, min(1.0, float(arm @ np.asarray(units.up)) / length))))
+    return f"{view.azimuth or 0.0:g} {elevation:.6g} {length / units.scale:.6g}"
 
 
 def _numbers(text: str, name: str, count: int) -> list[float]:
@@ -220,15 +203,15 @@ def _numbers(text: str, name: str, count: int) -> list[float]:
     return values
 
 
-def _etag(model: Model, picture: Picture) -> str:
-    """Changes whenever a byte of the answer could."""
-    camera = picture.camera
+def _etag(model: Model, request: RenderRequest) -> str:
+    """A hash of everything that the bytes of the image depend on."""
+    camera = request.camera
     parts = (
         graings.__version__,
         model.digest,
         camera.world_to_camera.tolist(),
         (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
-        (picture.time, picture.background, picture.format),
+        (request.time, request.background, request.format),
     )
     return f'"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}"'
 

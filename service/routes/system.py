@@ -1,4 +1,4 @@
-"""Routes of the service itself: options, health, and the page for people."""
+"""Routes of the service itself: options, health, and the web page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse, Response
 
 from graings.config import options
 from service.context import ContextDep
-from service.problems import AWAY, RESPONSES, problem
+from service.problems import RESPONSES, RETRY_LATER, problem
 from service.schemas import Readiness
 
 WEB = Path(__file__).resolve().parent.parent / "web"
@@ -26,7 +26,7 @@ router = APIRouter(tags=["system"])
 
 @router.get("/options", operation_id="get_options")
 def all_options() -> dict[str, Any]:
-    """Every training option with its default, bounds and a line of help, and the presets."""
+    """Every training option with default, bounds and description, and the presets."""
     return _options()
 
 
@@ -37,23 +37,21 @@ def _options() -> dict[str, Any]:
 
 @router.get("/healthz", operation_id="get_health")
 async def health() -> dict[str, str]:
-    """The process answers."""
+    """The process runs."""
     return {"status": "ok"}
 
 
 @router.get("/readyz", operation_id="get_readiness", response_model=Readiness, responses=RESPONSES)
-def readiness(request: Request, here: ContextDep) -> Readiness | Response:
+def readiness(request: Request, context: ContextDep) -> Readiness | Response:
     """The database answers and the disk has room."""
-    found = Readiness(ready=True, workers=here.leases.alive(), waiting=here.jobs.waiting(), free_mb=here.free_mb())
-    if found.free_mb < here.settings.min_free_mb:
-        least = here.settings.min_free_mb
-        return problem(
-            request, 503, f"{found.free_mb} MB free, at least {least} MB are needed.", kind="disk-full", headers=AWAY
-        )
-    return found
+    workers, waiting, free_mb = context.leases.alive(), context.jobs.waiting(), context.free_mb()
+    if free_mb < context.settings.min_free_mb:
+        detail = f"{free_mb} MB are free in the data folder, {context.settings.min_free_mb} MB are needed. Delete jobs."
+        return problem(request, 503, detail, kind="disk-full", headers=RETRY_LATER)
+    return Readiness(ready=True, workers=workers, waiting=waiting, free_mb=free_mb)
 
 
 @router.get("/", include_in_schema=False)
 async def page() -> Response:
-    """The page for people."""
+    """The web page."""
     return FileResponse(WEB / "index.html", headers=PAGE_HEADERS)

@@ -1,51 +1,51 @@
-// The page: jobs on the left, the scene in the middle, one job's numbers on the right. It keeps no truth of its own:
-// everything it shows comes from the REST interface beside it.
+// The page: jobs on the left, the scene in the middle, the numbers of one job on the right. All data come from the REST
+// interface of the same server.
 
 const $ = (id) => document.getElementById(id);
 const RENDER_SIDE = 512;
-const DRAFT_SIDE = 256; // while something moves
+const DRAFT_SIDE = 256; // while the viewpoint or the time changes
 const LIST_EVERY_MS = 4000;
 const PLAY_SECONDS = 4;
 
-const known = new Map(); // job resources by id
+const jobs = new Map(); // job resources by id
 let pages = 1;
 let current = null; // id of the job in the middle
 let stream = null;
 
-// ---- talking to the service
+// ---- requests
 
-async function ask(path, options) {
-  const answer = await fetch(path, options);
-  if (answer.status === 204) return null;
-  const body = await answer.json();
-  if (!answer.ok) throw new Error(body.detail || body.title || answer.statusText);
+async function request(path, options) {
+  const response = await fetch(path, options);
+  if (response.status === 204) return null;
+  const body = await response.json();
+  if (!response.ok) throw new Error(body.detail || body.title || response.statusText);
   return body;
 }
 
 // ---- jobs
 
 async function list() {
-  const found = [];
+  const listed = [];
   let path = "/jobs?limit=20";
   for (let page = 0; page < pages && path; page++) {
-    const answer = await ask(path);
-    found.push(...answer.jobs);
-    path = answer.next;
+    const body = await request(path);
+    listed.push(...body.jobs);
+    path = body.next;
   }
   $("more").hidden = !path;
-  known.clear();
-  for (const job of found) known.set(job.id, job);
-  draw();
+  jobs.clear();
+  for (const job of listed) jobs.set(job.id, job);
+  showJobs();
   if (current === null) {
-    const first = found.find((job) => job.checkpoint !== null) || found[0];
+    const first = listed.find((job) => job.checkpoint !== null) || listed[0];
     if (first) choose(first.id);
-  } else if (known.has(current)) {
-    facts(known.get(current));
+  } else if (jobs.has(current)) {
+    showJob(jobs.get(current));
   }
 }
 
-function draw() {
-  const rows = [...known.values()].map((job) => {
+function showJobs() {
+  const rows = [...jobs.values()].map((job) => {
     const button = element("button", { type: "button", "aria-current": String(job.id === current) });
     const top = element("span", { class: "top" });
     top.append(element("span", { class: "title" }, job.name), element("span", { class: `state ${job.state}` }, job.state));
@@ -65,7 +65,7 @@ function draw() {
 
 function summary(job) {
   const report = job.progress;
-  if (job.state === "queued") return report ? `waiting, goes on from ${count(job.checkpoint || 0)}` : "waiting for a worker";
+  if (job.state === "queued") return report ? `waiting, continues from ${count(job.checkpoint || 0)}` : "waiting for a worker";
   if (!report) return job.state === "running" ? "starting" : ago(job.created_at);
   const done = `${count(report.iteration)} of ${count(report.iterations)}`;
   if (job.state !== "running") return `${done} · ${ago(job.finished_at || job.created_at)}`;
@@ -74,13 +74,13 @@ function summary(job) {
 }
 
 function choose(id) {
-  const other = current !== id;
+  const changed = current !== id;
   current = id;
-  draw();
-  facts(known.get(id));
-  if (other) {
+  showJobs();
+  showJob(jobs.get(id));
+  if (changed) {
     Object.assign(orbit, START);
-    look();
+    render();
     follow(id);
   }
 }
@@ -89,20 +89,20 @@ function follow(id) {
   stream?.close();
   stream = new EventSource(`/jobs/${id}/events`);
   const update = (job) => {
-    const before = known.get(id);
-    known.set(id, job);
-    draw();
-    facts(job);
-    if (!before || before.checkpoint !== job.checkpoint) look();
+    const before = jobs.get(id);
+    jobs.set(id, job);
+    showJobs();
+    showJob(job);
+    if (!before || before.checkpoint !== job.checkpoint) render();
   };
   let refreshed = Date.now();
   stream.addEventListener("progress", (event) => {
-    const job = known.get(id);
+    const job = jobs.get(id);
     if (!job) return;
     update({ ...job, progress: JSON.parse(event.data) });
     if (Date.now() - refreshed > LIST_EVERY_MS) {
       refreshed = Date.now();
-      ask(`/jobs/${id}`).then((fresh) => current === id && update({ ...fresh, progress: known.get(id).progress }), complain);
+      request(`/jobs/${id}`).then((fresh) => current === id && update({ ...fresh, progress: jobs.get(id).progress }), showError);
     }
   });
   stream.addEventListener("state", (event) => update(JSON.parse(event.data)));
@@ -112,7 +112,7 @@ function follow(id) {
   });
 }
 
-function facts(job) {
+function showJob(job) {
   $("facts").hidden = !job;
   if (!job) return;
   const report = job.progress || {};
@@ -125,9 +125,10 @@ function facts(job) {
     ["Trained for", report.train_s != null && span(report.train_s)],
     ["Training views", report.psnr != null && `${report.psnr.toFixed(2)} dB`],
     ["Held-out views", report.held_out_psnr != null && `${report.held_out_psnr.toFixed(2)} dB`],
-    ["Gaussians drawn", report.gaussians != null && count(report.gaussians)],
+    ["Visible Gaussians", report.gaussians != null && count(report.gaussians)],
     ["Anchors", report.anchors != null && count(report.anchors)],
     ["Attempts", job.attempts > 1 && job.attempts],
+    ["Last event", report.events?.length && eventText(report.events.at(-1))],
   ].filter(([, value]) => value);
   $("name").textContent = job.name;
   $("error").hidden = !job.error;
@@ -135,12 +136,12 @@ function facts(job) {
   $("numbers").replaceChildren(...rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]));
 
   const verbs = ["cancel", "resume", "retry"].filter((verb) => job.links[verb]);
-  const buttons = verbs.map((verb) => action(verb, () => ask(job.links[verb], { method: "POST" })));
+  const buttons = verbs.map((verb) => action(verb, () => request(job.links[verb], { method: "POST" })));
   if (job.state !== "running") {
     buttons.push(action("delete", async () => {
       if (!confirm(`Delete "${job.name}" with its model?`)) return;
-      await ask(job.links.self, { method: "DELETE" });
-      known.delete(job.id);
+      await request(job.links.self, { method: "DELETE" });
+      jobs.delete(job.id);
       stream?.close();
       current = null;
     }));
@@ -162,33 +163,35 @@ function facts(job) {
   );
 }
 
-function action(verb, go) {
+const eventText = (event) => event.message ?? event;
+
+function action(verb, run) {
   const button = element("button", { type: "button", class: "quiet" }, verb[0].toUpperCase() + verb.slice(1));
   button.onclick = async () => {
     button.disabled = true;
     try {
-      await go();
+      await run();
       $("actions").dataset.verbs = "";
       await list();
-      if (current && known.get(current)) follow(current);
+      if (current && jobs.get(current)) follow(current);
     } catch (error) {
-      complain(error);
+      showError(error);
     }
     button.disabled = false;
   };
   return button;
 }
 
-// ---- the view: one request at a time, the latest wish next
+// ---- the view: one request at a time, then the newest one
 
 const START = { azimuth: 30, elevation: null, zoom: 1, radius: null };
 const orbit = { ...START };
 let busy = false;
-let wish = null;
+let pending = null;
 let settle = 0;
 
-function look(side = RENDER_SIDE) {
-  const job = known.get(current);
+function render(side = RENDER_SIDE) {
+  const job = jobs.get(current);
   if (!job || job.checkpoint === null) {
     $("view").hidden = true;
     $("empty").hidden = false;
@@ -201,36 +204,36 @@ function look(side = RENDER_SIDE) {
   query.set("azimuth", orbit.azimuth.toFixed(2));
   if (orbit.elevation !== null) query.set("elevation", orbit.elevation.toFixed(2));
   if (orbit.zoom !== 1 && orbit.radius !== null) query.set("radius", (orbit.radius * orbit.zoom).toPrecision(6));
-  wish = `/render?${query}`;
+  pending = `/render?${query}`;
   if (side !== RENDER_SIDE) {
     clearTimeout(settle);
-    settle = setTimeout(look, 250); // sharp again once the hand rests
+    settle = setTimeout(render, 250); // full resolution once the input stops
   }
   if (!busy) fetchView();
 }
 
 async function fetchView() {
   busy = true;
-  while (wish !== null) {
-    const address = wish;
-    wish = null;
+  while (pending !== null) {
+    const address = pending;
+    pending = null;
     try {
-      const answer = await fetch(address);
-      if (!answer.ok) throw new Error((await answer.json()).detail);
+      const response = await fetch(address);
+      if (!response.ok) throw new Error((await response.json()).detail);
       const image = $("view");
       const old = image.src;
-      image.src = URL.createObjectURL(await answer.blob());
+      image.src = URL.createObjectURL(await response.blob());
       await image.decode();
       URL.revokeObjectURL(old);
       image.hidden = false;
       $("empty").hidden = true;
-      const [, elevation, radius] = answer.headers.get("X-Graings-Orbit").split(" ").map(Number);
+      const [, elevation, radius] = response.headers.get("X-Graings-Orbit").split(" ").map(Number);
       orbit.radius ??= radius;
       orbit.shown = elevation;
-      const finished = answer.headers.get("X-Graings-Finished") === "true";
-      $("caption").textContent = finished ? "" : `iteration ${count(Number(answer.headers.get("X-Graings-Iteration")))}, still training`;
+      const finished = response.headers.get("X-Graings-Finished") === "true";
+      $("caption").textContent = finished ? "" : `iteration ${count(Number(response.headers.get("X-Graings-Iteration")))}, still training`;
     } catch (error) {
-      complain(error);
+      showError(error);
       await new Promise((resolve) => setTimeout(resolve, 500));
     }
   }
@@ -245,31 +248,31 @@ $("view").onpointermove = (event) => {
   if (!event.buttons) return;
   orbit.azimuth = (orbit.azimuth - event.movementX * 0.5) % 360;
   orbit.elevation = Math.max(-89, Math.min(89, (orbit.elevation ?? orbit.shown ?? 20) + event.movementY * 0.4));
-  look(DRAFT_SIDE);
+  render(DRAFT_SIDE);
 };
 $("view").onpointerup = (event) => {
   event.target.classList.remove("held");
-  look();
+  render();
 };
 $("view").ondblclick = () => {
   Object.assign(orbit, START);
-  look();
+  render();
 };
 $("frame").addEventListener("wheel", (event) => {
   event.preventDefault();
   orbit.zoom = Math.max(0.2, Math.min(5, orbit.zoom * Math.exp(event.deltaY * 0.001)));
-  look(DRAFT_SIDE);
+  render(DRAFT_SIDE);
 }, { passive: false });
 
 let playing = null;
 function setTime(t) {
   $("time").value = t;
   $("clock").value = Number($("time").value).toFixed(3);
-  look(playing === null ? RENDER_SIDE : DRAFT_SIDE);
+  render(playing === null ? RENDER_SIDE : DRAFT_SIDE);
 }
 $("time").oninput = () => {
   $("clock").value = Number($("time").value).toFixed(3);
-  look(DRAFT_SIDE);
+  render(DRAFT_SIDE);
 };
 $("play").onclick = () => {
   const on = playing === null;
@@ -278,24 +281,24 @@ $("play").onclick = () => {
   if (!on) {
     cancelAnimationFrame(playing);
     playing = null;
-    look();
+    render();
     return;
   }
   let before = performance.now();
   const step = (now) => {
     playing = requestAnimationFrame(step);
-    if (busy) return; // as fast as it is drawn
+    if (busy) return; // at most as fast as images are rendered
     setTime((Number($("time").value) + (now - before) / 1000 / PLAY_SECONDS) % 1);
     before = now;
   };
   playing = requestAnimationFrame(step);
 };
 
-// ---- sending a capture
+// ---- upload of a capture
 
 const form = $("upload");
 const file = form.elements.capture;
-file.onchange = () => ($("chosen").textContent = file.files[0]?.name || "Drop a capture here, or choose a zip or tar");
+file.onchange = () => ($("chosen").textContent = file.files[0]?.name || "Drop a capture here, or choose a zip or tar file");
 for (const name of ["dragover", "dragleave", "drop"]) {
   $("drop").addEventListener(name, (event) => {
     event.preventDefault();
@@ -311,34 +314,34 @@ form.onsubmit = (event) => {
   const capture = file.files[0];
   const query = new URLSearchParams({ preset: form.elements.preset.value, name: capture.name.replace(/\.(zip|tar|tgz|tar\.gz)$/i, "") });
   if (form.elements.config.value.trim()) query.set("config", form.elements.config.value);
-  const request = new XMLHttpRequest(); // fetch does not tell how much it has sent
-  request.open("POST", `/jobs?${query}`);
-  request.setRequestHeader("Content-Type", "application/octet-stream");
-  request.responseType = "json";
-  request.upload.onprogress = (progress) => ($("sending").value = progress.loaded / progress.total);
-  request.onloadend = () => {
+  const upload = new XMLHttpRequest(); // fetch does not report the progress of an upload
+  upload.open("POST", `/jobs?${query}`);
+  upload.setRequestHeader("Content-Type", "application/octet-stream");
+  upload.responseType = "json";
+  upload.upload.onprogress = (progress) => ($("sending").value = progress.loaded / progress.total);
+  upload.onloadend = () => {
     $("sending").hidden = true;
-    if (request.status === 202) {
+    if (upload.status === 202) {
       form.reset();
       file.onchange();
-      list().then(() => choose(request.response.id), complain);
+      list().then(() => choose(upload.response.id), showError);
     } else {
       $("refused").hidden = false;
-      $("refused").textContent = request.response?.detail || "The service did not answer.";
+      $("refused").textContent = upload.response?.detail || "The service does not answer.";
     }
   };
   $("refused").hidden = true;
   $("sending").hidden = false;
-  request.send(capture);
+  upload.send(capture);
 };
 
-// ---- small things
+// ---- elements and formats
 
 function element(name, attributes = {}, text = null) {
-  const made = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  if (text !== null) made.textContent = text;
-  return made;
+  const node = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  if (text !== null) node.textContent = text;
+  return node;
 }
 
 const count = (number) => Math.round(number).toLocaleString("en").replaceAll(",", " ");
@@ -354,14 +357,14 @@ function ago(moment) {
   return seconds < 5 ? "just now" : `${span(seconds).replace(/ \d+ (s|min)$/, "")} ago`;
 }
 
-function complain(error) {
+function showError(error) {
   $("health").textContent = error.message;
 }
 
 async function health() {
-  const found = await ask("/readyz");
-  const workers = found.workers === 1 ? "1 worker" : `${found.workers} workers`;
-  $("health").textContent = found.workers ? workers : "No worker: jobs wait. Start one with graings worker.";
+  const readiness = await request("/readyz");
+  const workers = readiness.workers === 1 ? "1 worker" : `${readiness.workers} workers`;
+  $("health").textContent = readiness.workers ? workers : "No worker: jobs wait. Start one with: graings worker";
 }
 
 async function refresh() {
@@ -369,13 +372,13 @@ async function refresh() {
     await health();
     await list();
   } catch (error) {
-    complain(error);
+    showError(error);
   }
   setTimeout(refresh, LIST_EVERY_MS);
 }
 
 $("more").onclick = () => {
   pages += 1;
-  list().catch(complain);
+  list().catch(showError);
 };
 refresh();

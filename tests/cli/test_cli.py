@@ -51,7 +51,7 @@ def pixels(file: Path) -> np.ndarray:
     return image
 
 
-def test_training_leaves_a_finished_model_with_its_numbers(run: Path) -> None:
+def test_training_writes_a_finished_model_and_its_metrics(run: Path) -> None:
     model = load_model(run)
     assert (model.iteration, model.finished, model.config.preset) == (20, True, "draft")
     assert model.config.init.points == 800
@@ -73,7 +73,7 @@ def test_resuming_a_finished_run_changes_nothing(run: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_training_keeps_a_checkpoint_and_says_how_to_go_on(
+def test_an_interrupted_training_keeps_a_checkpoint_and_prints_how_to_continue(
     capture: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
     folder = tmp_path / "run"
@@ -90,26 +90,26 @@ def test_an_interrupted_training_keeps_a_checkpoint_and_says_how_to_go_on(
     assert 0 < load_model(folder).iteration < make_config("draft").iterations
 
 
-def test_evaluating_test_views_adds_them_to_the_numbers(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluating_test_views_adds_them_to_metrics_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("evaluate", run, "--split", "test") == 0
     document = json.loads((run / "metrics.json").read_text())
     assert sorted(document["splits"]) == ["test", "val"]
     assert f"PSNR {document['splits']['test']['psnr']:.2f} dB" in capsys.readouterr().out
 
 
-def test_evaluating_on_another_background_leaves_the_numbers_as_they_are(
+def test_evaluating_on_another_background_does_not_change_metrics_json(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (run / "metrics.json").read_bytes()
-    said = []
+    outputs = []
     for background in ("white", "black"):
         assert graings("evaluate", run, "--background", background) == 0
-        said.append(capsys.readouterr().out)
-        assert f"On {background};" in said[-1]
+        outputs.append(capsys.readouterr().out)
+        assert f"On {background};" in outputs[-1]
     assert (run / "metrics.json").read_bytes() == before
-    assert f"PSNR {json.loads(before)['splits']['val']['psnr']:.2f} dB" in said[0]
-    assert "PSNR" in said[1]
-    assert said[1] != said[0]
+    assert f"PSNR {json.loads(before)['splits']['val']['psnr']:.2f} dB" in outputs[0]
+    assert "PSNR" in outputs[1]
+    assert outputs[1] != outputs[0]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".exr"])
@@ -119,7 +119,7 @@ def test_the_file_name_chooses_the_format(run: Path, tmp_path: Path, suffix: str
     assert pixels(file).shape == (32, 32, 3)
 
 
-def test_a_view_by_name_and_the_same_view_by_pose_are_the_same_picture(run: Path, tmp_path: Path) -> None:
+def test_a_view_by_name_and_the_same_view_by_pose_are_the_same_image(run: Path, tmp_path: Path) -> None:
     model = load_model(run)
     camera = model.views["test"][1].camera
     pose = {
@@ -130,7 +130,7 @@ def test_a_view_by_name_and_the_same_view_by_pose_are_the_same_picture(run: Path
     assert graings("render", run, "--t", 0.25, "--camera", "test:1", "-o", tmp_path / "a.exr") == 0
     assert graings("render", run, "--t", 0.25, "--pose", tmp_path / "pose.json", "-o", tmp_path / "b.exr") == 0
     a, b = pixels(tmp_path / "a.exr"), pixels(tmp_path / "b.exr")
-    assert a.std() > 0.01  # something is in the picture
+    assert a.std() > 0.01  # the image is not empty
     # Going to capture units and back moves a camera by rounding only; half floats are 2^-11 apart.
     assert np.abs(a - b).max() <= 2.0**-11
 
@@ -144,11 +144,11 @@ def test_an_orbit_takes_size_and_background(run: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(image[0, 0], (1.0, 0.0, 0.0))
 
 
-def test_a_time_outside_the_capture_is_clamped_and_said(
+def test_a_time_outside_the_capture_is_clamped_with_a_message(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert graings("render", run, "--t", 1.5, "--camera", "test:0", "-o", tmp_path / "late.png") == 0
-    assert "1.5 lies outside" in capsys.readouterr().out
+    assert "1.5 is outside" in capsys.readouterr().out
     assert graings("render", run, "--t", 1.0, "--camera", "test:0", "-o", tmp_path / "end.png") == 0
     np.testing.assert_array_equal(pixels(tmp_path / "late.png"), pixels(tmp_path / "end.png"))
 
@@ -157,9 +157,9 @@ def test_a_time_outside_the_capture_is_clamped_and_said(
     ("arguments", "word"),
     [
         (["--camera", "test:99"], "test:0 to test:"),
-        (["--camera", "test:0", "--azimuth", "3"], "choose one of"),
+        (["--camera", "test:0", "--azimuth", "3"], "choose one viewpoint"),
         (["--elevation", "91"], "elevation"),
-        (["--t", "nan"], "time"),
+        (["--t", "nan"], "t must be"),
         (["--background", "pink"], "background"),
         (["--width", "0"], "width"),
         (["--camera", "test:0", "-o", "view.gif"], "gif"),
@@ -179,41 +179,16 @@ def test_a_pose_file_without_a_key_is_refused_by_its_name(
     pose = tmp_path / "pose.json"
     pose.write_text(json.dumps({"world_to_camera": np.eye(4).tolist(), "fx": 50.0}))
     assert graings("render", run, "--pose", pose, "-o", tmp_path / "view.png") == 2
-    assert "fy, cx, cy, width, height missing" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert "width, height missing" in " ".join(capsys.readouterr().err.replace("│", " ").split())
 
 
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        ({"width": 1_000_000}, "width must be a whole number from 1 to 16384"),
-        ({"height": 24.5}, "height must be"),
-        ({"width": True}, "width must be"),
-        ({"width": "24"}, "width must be"),
-        ({"fx": 10**400}, "too large"),
-        ({"world_to_camera": [[10**400, 0, 0, 0]] * 4}, "too large"),
-    ],
-)
-def test_a_pose_file_with_a_wrong_number_is_refused_in_one_sentence(
-    run: Path, tmp_path: Path, change: dict[str, object], word: str, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("content", "word"), [("[" * 100_000, "not JSON"), ("[1]", "must be a JSON object")])
+def test_a_malformed_pose_file_is_refused(
+    run: Path, tmp_path: Path, content: str, word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    facts = {
-        "world_to_camera": np.eye(4).tolist(),
-        "fx": 50.0,
-        "fy": 50.0,
-        "cx": 12,
-        "cy": 12,
-        "width": 24,
-        "height": 24,
-    }
-    (tmp_path / "pose.json").write_text(json.dumps(facts | change))
+    (tmp_path / "pose.json").write_text(content)
     assert graings("render", run, "--pose", tmp_path / "pose.json", "-o", tmp_path / "view.png") == 2
     assert word in " ".join(capsys.readouterr().err.replace("│", " ").split())
-
-
-def test_a_pose_file_without_end_is_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "pose.json").write_text("[" * 100_000)
-    assert graings("render", run, "--pose", tmp_path / "pose.json", "-o", tmp_path / "view.png") == 2
-    assert "not JSON" in " ".join(capsys.readouterr().err.replace("│", " ").split())
 
 
 def test_a_missing_pose_file_is_an_input_error(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -221,12 +196,12 @@ def test_a_missing_pose_file_is_an_input_error(run: Path, tmp_path: Path, capsys
     assert "none.json: No such file or directory. Check the path." in " ".join(capsys.readouterr().err.split())
 
 
-@pytest.mark.skipif(not Path("/sys").is_dir(), reason="no folder that nobody may write to")
-def test_a_place_that_nobody_may_write_to_is_named_with_a_remedy(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.skipif(not Path("/sys").is_dir(), reason="no read-only folder")
+def test_a_read_only_path_is_named_with_a_remedy(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("render", run, "-o", "/sys/view.png") == 74
-    words = " ".join(capsys.readouterr().err.split())
-    assert "/sys/view.png" in words
-    assert "Name another place" in words
+    message = " ".join(capsys.readouterr().err.split())
+    assert "/sys/view.png" in message
+    assert "Choose another path" in message
 
 
 @pytest.mark.parametrize(
@@ -258,27 +233,27 @@ def test_a_mistake_is_one_clear_message_with_its_exit_code(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("verb", [["train", "CAPTURE"], ["ablate", "CAPTURE"], ["report", "RUN"]])
+@pytest.mark.parametrize("command", [["train", "CAPTURE"], ["ablate", "CAPTURE"], ["report", "RUN"]])
 @pytest.mark.parametrize("below", ["", "below"])
-def test_a_file_where_a_folder_is_wanted_is_named_and_left_alone(
-    capture: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: list[str], below: str
+def test_a_file_where_a_folder_is_needed_is_named_and_not_changed(
+    capture: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], below: str
 ) -> None:
     taken = tmp_path / "taken"
-    taken.write_text("mine")
+    taken.write_text("content")
     places = {"CAPTURE": capture, "RUN": run}
-    assert graings(*(places.get(word, word) for word in verb), "-o", taken / below) != 0
+    assert graings(*(places.get(word, word) for word in command), "-o", taken / below) != 0
     message = capsys.readouterr().err
     assert f"{taken}: " in message
     assert "Errno" not in message
-    assert taken.read_text() == "mine"
+    assert taken.read_text() == "content"
 
 
 def test_help_documents_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("--help") == 0
     page = " ".join(capsys.readouterr().out.split())
     assert "65 the capture or checkpoint cannot be used" in page
-    for verb in ("train", "render", "evaluate", "report", "options"):
-        assert verb in page
+    for command in ("train", "render", "evaluate", "report", "options"):
+        assert command in page
 
 
 def test_options_are_listed_with_value_bounds_and_help(
@@ -292,13 +267,15 @@ def test_options_are_listed_with_value_bounds_and_help(
     assert lines["rates.deformation"].split() == ["rates.deformation", "[0.002,", "5e-05]", "≥", "0", "DeformNet."]
 
 
-def test_every_option_says_what_it_is() -> None:
-    def silent(schema: dict[str, Any]) -> list[str]:
+def test_every_option_has_a_description() -> None:
+    def without_description(schema: dict[str, Any]) -> list[str]:
         parts = {"TrainConfig": schema, **schema["$defs"]}
-        fields = [(f"{part}.{name}", one) for part, facts in parts.items() for name, one in facts["properties"].items()]
-        return [name for name, one in fields if "description" not in one and "$ref" not in one]
+        fields = [
+            (f"{part}.{name}", option) for part, facts in parts.items() for name, option in facts["properties"].items()
+        ]
+        return [name for name, option in fields if "description" not in option and "$ref" not in option]
 
-    assert silent(TrainConfig.model_json_schema()) == []
+    assert without_description(TrainConfig.model_json_schema()) == []
 
 
 def test_options_as_json_are_the_schema(capsys: pytest.CaptureFixture[str]) -> None:
@@ -311,14 +288,14 @@ def test_options_as_json_are_the_schema(capsys: pytest.CaptureFixture[str]) -> N
 
 @pytest.fixture
 def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An installed package that brings one verb that works and one that lacks a package."""
+    """An installed package with a command that works and one that needs a missing package."""
     info = tmp_path / "juggling-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: juggling\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
-        "[graings.commands]\njuggle = juggling_verbs:juggle\nfloat = juggling_balloons:float\n"
+        "[graings.commands]\njuggle = juggling_commands:juggle\nfloat = juggling_balloons:float\n"
     )
-    (tmp_path / "juggling_verbs.py").write_text(
+    (tmp_path / "juggling_commands.py").write_text(
         "def juggle(balls: int = 3) -> None:\n    '''Keep balls in the air.'''\n    print(f'{balls} balls')\n"
     )
     (tmp_path / "juggling_balloons.py").write_text("import package_that_is_not_there\n")
@@ -326,7 +303,7 @@ def plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("plugins")
-def test_an_installed_package_can_bring_a_verb(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_installed_package_can_add_a_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("juggle", "--balls", 5) == 0
     assert capsys.readouterr().out == "5 balls\n"
     assert graings("--help") == 0
@@ -334,7 +311,7 @@ def test_an_installed_package_can_bring_a_verb(capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.usefixtures("plugins")
-def test_a_verb_that_cannot_be_loaded_says_so_when_it_is_used_and_not_before(
+def test_a_command_that_cannot_be_imported_fails_with_the_reason_only_when_it_is_used(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert graings("options", "--json") == 0

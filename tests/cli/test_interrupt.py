@@ -1,4 +1,4 @@
-"""Signals that come at a bad moment."""
+"""Signals during a print or without a reader of the output."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graings.cli.interrupt import Interrupt
 
 
 class _Interrupted(io.RawIOBase):
-    """A file whose first write is when the user presses Ctrl-C."""
+    """A file during whose first write the user presses Ctrl-C."""
 
     def __init__(self, number: signal.Signals) -> None:
         self.number: signal.Signals | None = number
@@ -31,7 +31,7 @@ class _Interrupted(io.RawIOBase):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_in_the_middle_of_a_print_is_answered_and_nothing_breaks(
+def test_a_signal_during_a_print_is_confirmed_and_breaks_nothing(
     number: signal.Signals, capfd: pytest.CaptureFixture[str]
 ) -> None:
     raw = _Interrupted(number)
@@ -48,8 +48,8 @@ def test_a_signal_in_the_middle_of_a_print_is_answered_and_nothing_breaks(
     assert interrupt.exit_code == 128 + number
 
 
-def test_a_signal_stops_also_where_nobody_listens_any_more() -> None:
-    """Ctrl-C goes to the whole pipe: with `2>&1 | tee log` the reader is gone when the answer is written."""
+def test_a_signal_is_recorded_also_if_the_reader_of_the_output_has_ended() -> None:
+    """Ctrl-C goes to the whole pipe: with `2>&1 | tee log` the reader has ended when the message is written."""
     reading, writing = os.pipe()
     os.close(reading)
     kept = os.dup(2)

@@ -1,17 +1,17 @@
-"""Lines for a person to read."""
+"""Lines of text for people."""
 
 from __future__ import annotations
 
 import pytest
 
-from graings.cli.terminal import waiting
+from graings.cli.terminal import busy_status
 
 
-def test_what_is_waited_for_is_shown_on_a_terminal_only(
+def test_a_status_is_shown_only_on_a_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for forced, said in (("", False), ("1", True)):
+    for forced, shown in (("", False), ("1", True)):
         monkeypatch.setenv("FORCE_COLOR", forced)
-        with waiting("reading [the] capture"):
+        with busy_status("reading [the] capture"):
             pass
-        assert ("reading [the] capture" in capsys.readouterr().out) == said
+        assert ("reading [the] capture" in capsys.readouterr().out) == shown

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from jobs.lease import FileLeases
 leases = FileLeases(Path(sys.argv[1]))
-print(leases.take(sys.argv[2]), flush=True)
+print(leases.acquire(sys.argv[2]), flush=True)
 sys.stdin.read()
 """
 
@@ -31,35 +31,35 @@ def holder(folder: Path, name: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def test_a_lease_has_one_holder_and_is_free_once_that_is_killed(tmp_path: Path) -> None:
+def test_a_lease_has_one_holder_and_is_free_once_it_is_killed(tmp_path: Path) -> None:
     leases = FileLeases(tmp_path)
     with holder(tmp_path, "a") as process:
-        assert not leases.take("a")
-        assert not leases.take_from_the_dead("a")
+        assert not leases.acquire("a")
+        assert not leases.acquire_from_dead("a")
         assert leases.alive() == 1
         process.kill()
         process.wait()
         assert leases.alive() == 0
-        assert leases.take_from_the_dead("a")
+        assert leases.acquire_from_dead("a")
     leases.close()
 
 
-def test_a_holder_that_left_counts_as_dead(tmp_path: Path) -> None:
+def test_a_holder_that_released_its_lease_counts_as_dead(tmp_path: Path) -> None:
     first, second = FileLeases(tmp_path), FileLeases(tmp_path)
-    assert first.take("a")
-    assert first.keep("a")
-    assert not second.keep("a")
+    assert first.acquire("a")
+    assert first.renew("a")
+    assert not second.renew("a")
     first.release("a")
     assert list(tmp_path.iterdir()) == []
-    assert second.take_from_the_dead("a")
+    assert second.acquire_from_dead("a")
 
 
-def test_looking_who_is_alive_disturbs_nobody(tmp_path: Path) -> None:
-    first, second, looker = FileLeases(tmp_path), FileLeases(tmp_path), FileLeases(tmp_path)
-    assert first.take("a")
-    assert second.take("b")
-    assert looker.alive() == first.alive() == 2
-    assert first.keep("a")
+def test_counting_leases_changes_none(tmp_path: Path) -> None:
+    first, second, observer = FileLeases(tmp_path), FileLeases(tmp_path), FileLeases(tmp_path)
+    assert first.acquire("a")
+    assert second.acquire("b")
+    assert observer.alive() == first.alive() == 2
+    assert first.renew("a")
     for leases in (first, second):
         leases.close()
-    assert looker.alive() == 0
+    assert observer.alive() == 0

@@ -1,4 +1,4 @@
-"""The same queue and leases on a PostgreSQL server that is started for the test, where its programs are installed."""
+"""The same queue and leases on a PostgreSQL server that is started for the test, if PostgreSQL is installed."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from jobs.job import JobError, JobState
 from jobs.lease import PostgresLeases, open_leases
 from jobs.queue import JobQueue
 from jobs.store import Store
-from tests.jobs.test_worker import ENDLESS, resting, submit, until, working
+from tests.jobs.test_worker import ENDLESS, is_idle, submit, until, working
 
 pytestmark = pytest.mark.slow
 
 
 def _user() -> str | None:
-    """Whom the server runs as: it refuses root."""
+    """The user that runs the server, which must not be root."""
     return "postgres" if os.geteuid() == 0 else pwd.getpwuid(os.geteuid()).pw_name
 
 
 class Server:
-    """A PostgreSQL server of our own, that can be stopped and started again."""
+    """A PostgreSQL server for the tests, which can be stopped and started again."""
 
     def __init__(self, folder: Path) -> None:
         with socket.socket() as probe:
@@ -58,11 +58,11 @@ class Server:
         until(lambda: subprocess.run(ready, check=False).returncode == 0)
 
     def stop(self) -> None:
-        self._process.send_signal(signal.SIGINT)  # end now, and tidily
+        self._process.send_signal(signal.SIGINT)  # fast shutdown
         self._process.wait()
 
     @contextmanager
-    def away(self) -> Iterator[None]:
+    def stopped(self) -> Iterator[None]:
         self.stop()
         try:
             yield
@@ -72,7 +72,7 @@ class Server:
 
 @contextmanager
 def serving(factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server for as long as the context lasts; skips the test where its programs are not installed."""
+    """A server for as long as the context lasts; skips the test if PostgreSQL is not installed."""
     if shutil.which("initdb") is None or shutil.which("postgres") is None:
         pytest.skip("PostgreSQL is not installed")
     server = Server(factory.mktemp("postgres"))
@@ -96,61 +96,63 @@ def url(server: Server) -> str:
 def test_a_lease_ends_with_its_session(url: str, tmp_path: Path) -> None:
     first, second = open_leases(url, tmp_path), open_leases(url, tmp_path)
     assert isinstance(first, PostgresLeases)
-    assert first.take("a")
-    assert not second.take_from_the_dead("a")
+    assert first.acquire("a")
+    assert not second.acquire_from_dead("a")
     assert second.alive() == 1
     first.close()
     until(lambda: second.alive() == 0)
-    assert second.take_from_the_dead("a")
+    assert second.acquire_from_dead("a")
     second.release("a")
     assert second.alive() == 0
     second.close()
 
 
-def test_a_lease_lost_with_its_connection_is_taken_again_unless_another_has_it(url: str, tmp_path: Path) -> None:
+def test_a_lease_whose_connection_was_closed_is_acquired_again_unless_another_holds_it(
+    url: str, tmp_path: Path
+) -> None:
     first, second = open_leases(url, tmp_path), open_leases(url, tmp_path)
     assert isinstance(first, PostgresLeases)
-    assert first.take("a")
+    assert first.acquire("a")
     first._connection.close()
-    assert first.keep("a")
-    assert not second.take("a")
+    assert first.renew("a")
+    assert not second.acquire("a")
     first._connection.close()
-    until(lambda: second.take("a"))
-    assert not first.keep("a")
+    until(lambda: second.acquire("a"))
+    assert not first.renew("a")
     first.close()
     second.close()
 
 
-def test_leases_say_that_the_database_is_away_and_go_on_when_it_is_back(server: Server, tmp_path: Path) -> None:
-    holder, looker = open_leases(server.url, tmp_path), open_leases(server.url, tmp_path)
-    assert holder.take("a")
-    assert looker.alive() == 1
-    with server.away():
-        for ask in (looker.alive, lambda: holder.keep("a"), lambda: looker.take_from_the_dead("a")):
+def test_leases_raise_while_the_database_is_stopped_and_work_after_its_restart(server: Server, tmp_path: Path) -> None:
+    holder, observer = open_leases(server.url, tmp_path), open_leases(server.url, tmp_path)
+    assert holder.acquire("a")
+    assert observer.alive() == 1
+    with server.stopped():
+        for ask in (observer.alive, lambda: holder.renew("a"), lambda: observer.acquire_from_dead("a")):
             with pytest.raises(JobError, match="does not answer"):
                 ask()
-    assert looker.alive() == 0
-    assert holder.keep("a")
-    assert looker.alive() == 1
-    assert not looker.take("a")
+    assert observer.alive() == 0
+    assert holder.renew("a")
+    assert observer.alive() == 1
+    assert not observer.acquire("a")
     holder.close()
-    looker.close()
+    observer.close()
 
 
 def test_leases_in_other_databases_of_the_server_do_not_count(url: str, tmp_path: Path) -> None:
     with psycopg.connect(url, autocommit=True) as connection:
         connection.execute("create database other")
     here, there = open_leases(url, tmp_path), open_leases(url.replace("/postgres", "/other"), tmp_path)
-    assert there.take("a")
+    assert there.acquire("a")
     assert (here.alive(), there.alive()) == (0, 1)
     here.close()
     there.close()
 
 
-def test_nobody_waits_without_limit_for_others_who_wait_for_the_database(
+def test_waiting_for_the_session_of_another_thread_has_a_limit(
     url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("jobs.lease._TURN_S", 0.1)
+    monkeypatch.setattr("jobs.lease._SESSION_WAIT_S", 0.1)
     leases = open_leases(url, tmp_path)
     assert isinstance(leases, PostgresLeases)
     with leases._guard, ThreadPoolExecutor() as pool, pytest.raises(JobError, match="does not answer"):
@@ -165,10 +167,10 @@ def test_a_database_for_leases_that_cannot_be_opened_is_named_without_its_passwo
     assert "secret" not in str(caught.value)
 
 
-def test_everything_asked_of_the_queue_fails_at_once_while_the_database_is_away(server: Server) -> None:
+def test_every_operation_on_the_queue_fails_at_once_while_the_database_is_stopped(server: Server) -> None:
     engine = Engine(server.url)
     engine.enqueue("a", 10)
-    questions: list[Callable[[], object]] = [
+    operations: list[Callable[[], object]] = [
         lambda: engine.enqueue("b", 10),
         lambda: engine.entries(["a"]),
         engine.running,
@@ -178,8 +180,8 @@ def test_everything_asked_of_the_queue_fails_at_once_while_the_database_is_away(
         lambda: engine.rewind("a"),
         lambda: engine.delete("a"),
     ]
-    with ThreadPoolExecutor(len(questions)) as pool, server.away():
-        for answer in [pool.submit(question) for question in questions]:
+    with ThreadPoolExecutor(len(operations)) as pool, server.stopped():
+        for answer in [pool.submit(operation) for operation in operations]:
             with pytest.raises(JobError, match="does not answer"):
                 answer.result(10)
     assert engine.entries(["a", "b"]).keys() == {"a"}
@@ -187,34 +189,36 @@ def test_everything_asked_of_the_queue_fails_at_once_while_the_database_is_away(
     engine.close()
 
 
-def test_a_worker_goes_on_when_the_database_is_back_and_leaves_while_it_is_away(server: Server, tmp_path: Path) -> None:
-    engine, looker = Engine(server.url), open_leases(server.url, tmp_path)
+def test_a_worker_survives_a_restart_of_the_database_and_can_end_while_it_is_stopped(
+    server: Server, tmp_path: Path
+) -> None:
+    engine, observer = Engine(server.url), open_leases(server.url, tmp_path)
     jobs = JobQueue(Store(tmp_path / "data"), engine)
     job_id = submit(jobs, ENDLESS)
     folder = jobs.store.folder(job_id)
     with working(jobs, server.url) as worker:
         until(lambda: folder.checkpoint())
-        with server.away():
+        with server.stopped():
             reached = folder.checkpoint() or 0
             time.sleep(3.0)  # longer than a round of the worker
             until(lambda: (folder.checkpoint() or 0) > reached)
-        until(lambda: looker.alive() == 1)
+        until(lambda: observer.alive() == 1)
         assert jobs.get(job_id).state is JobState.RUNNING
         assert len(folder.attempts()) == 1
-        with server.away():
+        with server.stopped():
             worker.terminate()
             assert worker.wait(60) == 0
-            assert resting(jobs, job_id)
-    assert looker.alive() == 0
-    with working(jobs, server.url):  # takes the job of the one that could not give it back
+            assert is_idle(jobs, job_id)
+    assert observer.alive() == 0
+    with working(jobs, server.url):  # takes the job that the first worker could not return
         until(lambda: len(folder.attempts()) == 2)
         jobs.cancel(job_id)
-        until(lambda: resting(jobs, job_id))
-    looker.close()
+        until(lambda: is_idle(jobs, job_id))
+    observer.close()
     engine.close()
 
 
-def test_a_job_outlives_kill_9_of_its_worker(url: str, tmp_path: Path) -> None:
+def test_another_worker_continues_the_job_of_a_killed_one(url: str, tmp_path: Path) -> None:
     engine = Engine(url)
     jobs = JobQueue(Store(tmp_path / "data"), engine)
     job_id = submit(jobs, ENDLESS)
@@ -222,11 +226,11 @@ def test_a_job_outlives_kill_9_of_its_worker(url: str, tmp_path: Path) -> None:
     with working(jobs, url) as first, working(jobs, url) as second:
         until(lambda: folder.checkpoint())
         owner = folder.attempts()[0].worker
-        next(one for one in (first, second) if f"-{one.pid}-" in owner).send_signal(signal.SIGKILL)
+        next(process for process in (first, second) if f"-{process.pid}-" in owner).send_signal(signal.SIGKILL)
         until(lambda: len(folder.attempts()) == 2)
         taken_over = folder.attempts()[1]
         assert taken_over.worker != owner
         until(lambda: (folder.checkpoint() or 0) > taken_over.checkpoint > 0)
         assert jobs.cancel(job_id).state is JobState.CANCELLED
-        until(lambda: resting(jobs, job_id))
+        until(lambda: is_idle(jobs, job_id))
     engine.close()

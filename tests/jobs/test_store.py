@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from jobs.exit_code import ExitCode
-from jobs.files import locked
 from jobs.job import JobConflict, JobDamaged, JobNotFound, JobSpec
+from jobs.locks import locked
 from jobs.store import LEFTOVER_S, Store, discard_leftovers
 
 DIGEST = "ab" * 32
@@ -39,7 +39,9 @@ def test_a_job_comes_back_as_it_was_stored(tmp_path: Path) -> None:
 def test_newer_jobs_come_first(tmp_path: Path) -> None:
     store = Store(tmp_path)
     ids = [store.create(spec(str(i)), unpacked(store, "u", "a.json")) for i in range(4)]
-    assert [int(one[:11], 16) for one in store.ids()] == sorted((int(one[:11], 16) for one in ids), reverse=True)
+    assert [int(job_id[:11], 16) for job_id in store.ids()] == sorted(
+        (int(job_id[:11], 16) for job_id in ids), reverse=True
+    )
 
 
 def test_a_capture_begins_below_folders_that_hold_only_a_folder(tmp_path: Path) -> None:
@@ -48,7 +50,7 @@ def test_a_capture_begins_below_folders_that_hold_only_a_folder(tmp_path: Path) 
     assert (store.capture(DIGEST) / "transforms_train.json").is_file()
 
 
-def test_equal_captures_are_stored_once_and_go_with_their_last_job(tmp_path: Path) -> None:
+def test_equal_captures_are_stored_once_and_removed_with_their_last_job(tmp_path: Path) -> None:
     store = Store(tmp_path)
     first = store.create(spec(), unpacked(store, "u", "a.json"))
     second = store.create(spec(), unpacked(store, "v", "a.json"))
@@ -61,7 +63,7 @@ def test_equal_captures_are_stored_once_and_go_with_their_last_job(tmp_path: Pat
         store.folder(second)
 
 
-def test_a_job_whose_trainer_still_writes_is_not_deleted(tmp_path: Path) -> None:
+def test_a_job_is_not_deleted_while_its_trainer_runs(tmp_path: Path) -> None:
     store = Store(tmp_path)
     job_id = store.create(spec(), unpacked(store, "u", "a.json"))
     with locked(store.folder(job_id).lock), pytest.raises(JobConflict, match="few seconds"):
@@ -69,18 +71,19 @@ def test_a_job_whose_trainer_still_writes_is_not_deleted(tmp_path: Path) -> None
     store.delete(job_id)
 
 
-def test_attempts_are_counted_before_they_can_fail(tmp_path: Path) -> None:
+def test_attempts_are_recorded_before_they_end(tmp_path: Path) -> None:
     store = Store(tmp_path)
     folder = store.folder(store.create(spec(), unpacked(store, "u", "a.json")))
     first = folder.begin_attempt("worker-a")
-    assert [(one.number, one.exit_code) for one in folder.attempts()] == [(1, None)]
+    assert [(attempt.number, attempt.exit_code) for attempt in folder.attempts()] == [(1, None)]
     folder.end_attempt(first, ExitCode.CRASHED, "boom")
     second = folder.begin_attempt("worker-b")
-    assert [(one.number, one.exit_code, one.message) for one in folder.attempts()] == [(1, 1, "boom"), (2, None, None)]
+    recorded = [(attempt.number, attempt.exit_code, attempt.message) for attempt in folder.attempts()]
+    assert recorded == [(1, 1, "boom"), (2, None, None)]
     assert second.checkpoint == 0
 
 
-def test_what_is_no_job_is_none_of_the_stores(tmp_path: Path) -> None:
+def test_other_files_in_the_folder_of_jobs_are_ignored(tmp_path: Path) -> None:
     store = Store(tmp_path)
     job_id = store.create(spec(), unpacked(store, "u", "a.json"))
     (tmp_path / "jobs" / ".DS_Store").write_text("")
@@ -90,7 +93,7 @@ def test_what_is_no_job_is_none_of_the_stores(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"spec": 3}', '{"spec": {"name": "a"}}', None])
-def test_a_job_that_cannot_be_read_says_so_and_can_be_deleted(tmp_path: Path, content: str | None) -> None:
+def test_a_damaged_job_names_its_file_and_can_be_deleted(tmp_path: Path, content: str | None) -> None:
     store = Store(tmp_path)
     damaged = store.create(spec(capture="cd" * 32), unpacked(store, "u", "a.json"))
     whole = store.create(spec(), unpacked(store, "v", "a.json"))
@@ -99,11 +102,11 @@ def test_a_job_that_cannot_be_read_says_so_and_can_be_deleted(tmp_path: Path, co
     with pytest.raises(JobDamaged, match=r"job\.json.*Delete the job"):
         store.folder(damaged).spec()
     other = store.create(spec(), unpacked(store, "w", "a.json"))
-    store.delete(other)  # a damaged neighbour keeps nobody from it, and what may be its capture stays
+    store.delete(other)  # possible beside a damaged job, whose capture must stay
     assert len(list((tmp_path / "captures").iterdir())) == 2
     store.delete(damaged)
     assert store.ids() == [whole]
-    assert [one.name for one in (tmp_path / "captures").iterdir()] == [DIGEST]
+    assert [path.name for path in (tmp_path / "captures").iterdir()] == [DIGEST]
 
 
 def test_damaged_attempts_name_their_file(tmp_path: Path) -> None:
@@ -114,7 +117,7 @@ def test_damaged_attempts_name_their_file(tmp_path: Path) -> None:
         folder.attempts()
 
 
-def test_a_capture_that_lost_a_file_is_replaced_by_the_same_upload(tmp_path: Path) -> None:
+def test_a_capture_with_a_missing_file_is_replaced_by_the_same_upload(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.create(spec(), unpacked(store, "u", "a.json", "b.png"))
     (store.capture(DIGEST) / "b.png").unlink()
@@ -124,13 +127,13 @@ def test_a_capture_that_lost_a_file_is_replaced_by_the_same_upload(tmp_path: Pat
 
 
 def age(path: Path, seconds: float) -> None:
-    """Have everything at and below `path` look as if written so long ago."""
+    """Set the last change of `path` and of everything below it to `seconds` ago."""
     then = time.time() - seconds
-    for one in (path, *path.rglob("*")):
-        os.utime(one, (then, then))
+    for item in (path, *path.rglob("*")):
+        os.utime(item, (then, then))
 
 
-def test_what_nobody_wrote_to_for_long_is_removed(tmp_path: Path) -> None:
+def test_an_upload_without_a_recent_write_is_removed(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for name, seconds in (("old", LEFTOVER_S + 60), ("young", LEFTOVER_S - 60)):
         (store.uploads / f"{name}.part").write_text("")
@@ -138,22 +141,22 @@ def test_what_nobody_wrote_to_for_long_is_removed(tmp_path: Path) -> None:
         age(store.uploads / f"{name}.part", seconds)
         age(store.uploads / name, seconds)
     discard_leftovers(store.uploads)
-    assert sorted(one.name for one in store.uploads.iterdir()) == ["young", "young.part"]
+    assert sorted(path.name for path in store.uploads.iterdir()) == ["young", "young.part"]
 
 
-def test_an_upload_that_is_being_unpacked_is_no_leftover(tmp_path: Path) -> None:
-    """Its archive came long ago and its folder was made long ago: only a file deep inside is new."""
+def test_an_upload_that_is_being_unpacked_is_kept(tmp_path: Path) -> None:
+    """Its archive and its folder are old: only a file deep inside is new."""
     store = Store(tmp_path)
     (store.uploads / "u.part").write_text("")
     folder = unpacked(store, "u", "train/a.json")
-    for one in (store.uploads / "u.part", folder):
-        age(one, 2 * LEFTOVER_S)
+    for path in (store.uploads / "u.part", folder):
+        age(path, 2 * LEFTOVER_S)
     (folder / "train" / "a.json").write_text("more")
     discard_leftovers(store.uploads)
-    assert sorted(one.name for one in store.uploads.iterdir()) == ["u", "u.part"]
+    assert sorted(path.name for path in store.uploads.iterdir()) == ["u", "u.part"]
 
 
-def test_a_leftover_that_cannot_be_removed_is_logged_and_keeps_none_of_the_others(
+def test_a_leftover_that_cannot_be_removed_is_logged_and_the_others_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     store = Store(tmp_path)
@@ -167,15 +170,17 @@ def test_a_leftover_that_cannot_be_removed_is_logged_and_keeps_none_of_the_other
 
     monkeypatch.setattr(shutil, "rmtree", denied)
     discard_leftovers(store.uploads)
-    assert sorted(one.name for one in store.uploads.iterdir()) == ["u", "v"]
+    assert sorted(path.name for path in store.uploads.iterdir()) == ["u", "v"]
     assert caplog.text.count("denied") == 2
 
 
-def test_an_old_job_that_is_being_deleted_is_no_leftover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another process that cleans up meanwhile would make the deletion fail."""
+def test_an_old_job_that_is_being_deleted_is_not_taken_for_a_leftover(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise another process that removes leftovers meanwhile would make the deletion fail."""
     store = Store(tmp_path)
     job_id = store.create(spec(), unpacked(store, "u", "a.json"))
-    store.folder(job_id).lock.touch()  # a trainer was at it once
+    store.folder(job_id).lock.touch()  # as left by a trainer
     age(store.folder(job_id).path, 2 * LEFTOVER_S)
     remove = shutil.rmtree
 
@@ -190,20 +195,22 @@ def test_an_old_job_that_is_being_deleted_is_no_leftover(tmp_path: Path, monkeyp
     assert list((tmp_path / "captures").iterdir()) == []
 
 
-def test_a_new_job_is_on_the_disk_before_anyone_hears_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What only the memory knows of is lost with the power: the images, and renames unless their folder is synced."""
+def test_a_new_job_is_synced_to_the_disk_before_its_id_is_returned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power failure discards what is not synced: the content of files, and renames whose folder is not synced."""
     store = Store(tmp_path)
     capture = unpacked(store, "u", "a.json", "images/b.png")
     written = {(path.stat().st_ino, path.stat().st_size) for path in capture.rglob("*") if path.is_file()}
     synced: list[tuple[int, list[str]]] = []
-    files: set[tuple[int, int]] = set()  # before the capture is where it belongs
+    files: set[tuple[int, int]] = set()  # synced before the capture is moved
 
     def fsync(handle: int) -> None:
-        found = os.fstat(handle)
-        if stat.S_ISDIR(found.st_mode):
-            synced.append((found.st_ino, os.listdir(handle)))
+        status = os.fstat(handle)
+        if stat.S_ISDIR(status.st_mode):
+            synced.append((status.st_ino, os.listdir(handle)))
         elif not any((tmp_path / "captures").iterdir()):
-            files.add((found.st_ino, found.st_size))
+            files.add((status.st_ino, status.st_size))
 
     monkeypatch.setattr(os, "fsync", fsync)
     job_id = store.create(spec(), capture)

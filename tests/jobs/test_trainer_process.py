@@ -37,62 +37,47 @@ def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_p
     next((store.capture("0" * 64) / "train").glob("*.png")).unlink()
     with trainer(folder) as process:
         assert process.stdout is not None
-        said = process.stdout.read()  # its standard input stays open: closing that would tell it to stop
+        output = process.stdout.read()  # its standard input stays open: closing it would stop the trainer
         assert process.wait(60) == ExitCode.REFUSED
-    assert "train/r_" in json.loads(said)["error"]
+    assert "train/r_" in json.loads(output)["error"]
     assert folder.checkpoint() is None
 
 
 def test_a_finished_job_has_its_report(tmp_path: Path) -> None:
     folder = job(Store(tmp_path), {"iterations": 12})
-    for _ in range(KEPT_ATTEMPTS + 2):  # of which the store forgets the first two
+    for _ in range(KEPT_ATTEMPTS + 2):  # of which the store keeps all but the first two
         folder.begin_attempt("worker")
     with trainer(folder) as process:
         assert process.wait(60) == ExitCode.DONE
-    told, _ = read_progress(folder.progress, 0)
-    assert told[0][1].attempt == KEPT_ATTEMPTS + 2
+    reports, _ = read_progress(folder.progress, 0)
+    assert reports[0][1].attempt == KEPT_ATTEMPTS + 2
     document = json.loads((folder.report / "work_precision.json").read_text())
     assert document["training"][0]["run"]["name"] == folder.path.name
     assert len(document["render"][0]["points"]) > 1
     assert {"training.svg", "render.svg", "points.csv"} < {path.name for path in folder.report.iterdir()}
 
 
-def test_a_job_that_waited_for_this_version_is_trained_as_it_was_asked_for(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    asked = job(store, {"iterations": 12}).spec()
-    asked.config.pop("batch")
-    asked.config["loss"].pop("rigidity")
-    asked.config["loss"].pop("squared")
-    asked.config["loss"].pop("alpha")
-    folder = store.folder(store.create(asked, write_synthetic(store.uploads / "v", frames=6, size=24)))
-    with trainer(folder) as process:
-        assert process.wait(60) == ExitCode.DONE
-    trained = load_model(folder.run).config
-    assert trained.batch == 1
-    assert (trained.loss.rigidity, trained.loss.squared, trained.loss.alpha) == (0.0, 0.0, 0.0)
-
-
-def test_trouble_with_the_report_is_logged_and_ends_nothing(
+def test_an_error_in_the_report_is_logged_and_the_job_does_not_fail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def broken(*_: object, **__: object) -> NoReturn:
-        raise RuntimeError("no ink")
+        raise RuntimeError("no disk")
 
     monkeypatch.setattr("jobs.trainer_process.report_runs", broken)
     _report(job(Store(tmp_path)))
-    assert "no report: RuntimeError: no ink" in capsys.readouterr().err
+    assert "no report: RuntimeError: no disk" in capsys.readouterr().err
 
 
-def test_a_training_that_comes_apart_ends_diverged_with_a_model_and_a_last_report(tmp_path: Path) -> None:
+def test_a_training_that_diverges_ends_with_a_model_and_a_last_report(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    # A rate that grows out of all bounds: the first steps are sound, a few dozen later the numbers run out.
+    # The learning rate grows without bound: the first steps are finite, those a few dozen later are not.
     blow_up = {"iterations": 200, "evaluation.first": 2, "rates.deformation": [0.005, 1e30], "guard.patience": 5}
     folder = job(store, blow_up)
     with trainer(folder) as process:
         assert process.stdout is not None
-        said = process.stdout.read()
+        output = process.stdout.read()
         assert process.wait(60) == ExitCode.DIVERGED
-    assert "diverged" in json.loads(said)["error"]
+    assert "diverged" in json.loads(output)["error"]
     model = load_model(folder.run)
     assert folder.checkpoint() == model.iteration
     assert all(bool(values.isfinite().all()) for values in model.scene.state_dict().values())

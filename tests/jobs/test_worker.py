@@ -17,14 +17,14 @@ from graings.config import make_config
 from jobs.commands import default_database
 from jobs.engine import Engine
 from jobs.exit_code import ExitCode
-from jobs.files import locked
 from jobs.job import Attempt, JobConflict, JobSpec, JobState
+from jobs.locks import locked
 from jobs.queue import JobQueue
 from jobs.store import Store
-from jobs.worker import MAX_CRASHES, MAX_LOSSES, give_up_reason
+from jobs.worker import MAX_CRASHES, MAX_WORKER_DEATHS, give_up_reason
 
 LONG_S = 120.0
-# Long enough to be interrupted; what is interrupted starts over from a checkpoint at most 20 iterations back.
+# Long enough to be interrupted, with a checkpoint every 20 iterations.
 ENDLESS = {"iterations": 100_000, "init.points": 300, "evaluation.checkpoint_every": 20, "evaluation.first": 99_000}
 BRIEF = {"iterations": 30, "init.points": 300, "evaluation.views": 1}
 
@@ -58,17 +58,19 @@ def working(jobs: JobQueue, url: str | None = None) -> Iterator[subprocess.Popen
 def until(condition: Callable[[], object]) -> None:
     deadline = time.monotonic() + LONG_S
     while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
+        assert time.monotonic() < deadline, f"not reached within {LONG_S:g} s"
         time.sleep(0.1)
 
 
-def resting(jobs: JobQueue, job_id: str) -> bool:
-    """Whether no trainer is in the job's folder."""
+def is_idle(jobs: JobQueue, job_id: str) -> bool:
+    """Whether no trainer holds the job's folder."""
     with locked(jobs.store.folder(job_id).lock, wait=False) as free:
         return free
 
 
-def test_a_job_outlives_kill_9_of_its_worker_and_leaving_brings_it_back_in_the_queue(jobs: JobQueue) -> None:
+def test_another_worker_continues_the_job_of_a_killed_one_and_returns_it_to_the_queue_when_stopped(
+    jobs: JobQueue,
+) -> None:
     job_id = submit(jobs, ENDLESS)
     folder = jobs.store.folder(job_id)
     with working(jobs) as first:
@@ -76,19 +78,19 @@ def test_a_job_outlives_kill_9_of_its_worker_and_leaving_brings_it_back_in_the_q
         first.send_signal(signal.SIGKILL)
         first.wait()
         reached = folder.checkpoint() or 0
-        assert jobs.get(job_id).state is JobState.RUNNING  # nobody knows better yet
+        assert jobs.get(job_id).state is JobState.RUNNING  # no other worker has noticed yet
     with working(jobs) as second:
         until(lambda: jobs.get(job_id).attempts == 2)
-        lost, taken_over = folder.attempts()
-        assert lost.exit_code is None
-        assert lost.worker != taken_over.worker
+        killed, taken_over = folder.attempts()
+        assert killed.exit_code is None
+        assert killed.worker != taken_over.worker
         assert taken_over.checkpoint >= reached > 0
-        # The orphan noticed its parent's death and stopped at a checkpoint; the new trainer goes on beyond it.
+        # The first trainer noticed that its worker ended and stopped at a checkpoint, from which the new one continues.
         until(lambda: (folder.checkpoint() or 0) > taken_over.checkpoint)
         second.terminate()
         assert second.wait(LONG_S) == 0
     job = jobs.get(job_id)
-    assert (job.state, resting(jobs, job_id)) == (JobState.QUEUED, True)
+    assert (job.state, is_idle(jobs, job_id)) == (JobState.QUEUED, True)
     assert folder.attempts()[-1].exit_code == ExitCode.STOPPED
     assert job.progress is not None
     assert job.checkpoint is not None
@@ -110,7 +112,7 @@ def test_jobs_are_cancelled_resumed_retried_and_finished(jobs: JobQueue) -> None
         with pytest.raises(JobConflict, match="Use resume"):
             jobs.retry(endless)
         until(lambda: jobs.get(brief).state.final and jobs.get(broken).state.final)
-        assert resting(jobs, endless)
+        assert is_idle(jobs, endless)
 
         done = jobs.get(brief)
         assert (done.state, done.error, done.checkpoint) == (JobState.SUCCEEDED, None, 30)
@@ -131,7 +133,7 @@ def test_jobs_are_cancelled_resumed_retried_and_finished(jobs: JobQueue) -> None
         reached = jobs.get(endless).checkpoint or 0
         jobs.resume(endless)
         until(lambda: (jobs.get(endless).checkpoint or 0) > reached)
-        # Cancelled and resumed before the worker can notice: still only one trainer, and it goes on.
+        # Cancelled and resumed before the worker notices: there is still only one trainer, and it continues.
         jobs.cancel(endless)
         jobs.resume(endless)
         until(lambda: jobs.get(endless).attempts == 3)
@@ -145,14 +147,14 @@ def attempts(*exit_codes: int | None, checkpoint: int = 0, final: bool = False) 
     return [Attempt(i, "w", 0.0, checkpoint, None, code, None, final) for i, code in enumerate(exit_codes, start=1)]
 
 
-def test_a_job_is_given_up_when_attempts_in_a_row_end_badly_at_the_same_checkpoint() -> None:
+def test_a_job_fails_when_attempts_in_a_row_fail_at_the_same_checkpoint() -> None:
     assert give_up_reason(attempts(*[1] * (MAX_CRASHES - 1)), 0) is None
     assert "exit code 1" in (give_up_reason(attempts(*[1] * MAX_CRASHES), 0) or "")
     assert "memory" in (give_up_reason(attempts(*[-9] * MAX_CRASHES), 0) or "")
-    assert "worker died" in (give_up_reason(attempts(*[None] * MAX_LOSSES), 0) or "")
+    assert "worker died" in (give_up_reason(attempts(*[None] * MAX_WORKER_DEATHS), 0) or "")
 
 
-def test_progress_a_stop_on_request_and_a_retry_start_the_count_anew() -> None:
+def test_progress_a_requested_stop_and_a_retry_reset_the_count_of_failures() -> None:
     assert give_up_reason(attempts(*[1] * 9, checkpoint=100), 200) is None
     assert give_up_reason(attempts(*[ExitCode.STOPPED] * 99), 0) is None
     assert give_up_reason(attempts(*[1] * 9, final=True), 0) is None

@@ -1,4 +1,4 @@
-"""A real service on a real SQLite database in a temporary folder; no worker: jobs stay where a test puts them."""
+"""A service on a SQLite database in a temporary folder, without a worker: jobs keep the state that a test sets."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def archive(capture: Path) -> bytes:
 
 @pytest.fixture(scope="session")
 def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder that was trained for a moment."""
+    """A run folder after a short training."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     config = make_config("draft", {"iterations": ITERATIONS, "init.points": 200, "threads": 1})
     assert [report.iteration for report in TrainingRun.create(capture, folder, config)][-1] == ITERATIONS
@@ -42,7 +42,12 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
     return Settings(
-        data=tmp_path / "data", max_upload_mb=1, max_unpacked_mb=2, max_files=100, min_free_mb=0, names="testserver"
+        data=tmp_path / "data",
+        max_upload_mb=1,
+        max_unpacked_mb=2,
+        max_files=100,
+        min_free_mb=0,
+        allowed_hosts="testserver",
     )
 
 

@@ -1,4 +1,4 @@
-"""What strangers may send. Each archive is really built, and really refused."""
+"""Untrusted archives: each is built in the test."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, link: str = "") -> tarfile.
 
 
 def refused(archive: Path, limits: Limits = LIMITS) -> str:
-    """The message with which an archive is refused; nothing may be left of it, inside or outside of its folder."""
+    """The message with which an archive is refused; it must leave no files, inside or outside of its folder."""
     before = sorted(archive.parent.rglob("*"))
     with pytest.raises(ArchiveError) as caught:
         unpack(archive, archive.parent / "out", limits)
@@ -55,7 +55,7 @@ def refused(archive: Path, limits: Limits = LIMITS) -> str:
 
 @pytest.mark.parametrize("mode", ["zip", "w:gz"])
 def test_any_damaged_byte_is_refused_or_harmless(tmp_path: Path, mode: str) -> None:
-    """One error class of a library that nobody thought of would be a failure of the service."""
+    """Otherwise an unexpected error class of a library would be an error of the service."""
     files = {"transforms_train.json": b'{"frames": []}', "train/r_0.png": bytes(range(256))}
     if mode == "zip":
         archive = zipped(tmp_path / "whole", files, compression=zipfile.ZIP_DEFLATED)
@@ -78,21 +78,21 @@ def test_any_damaged_byte_is_refused_or_harmless(tmp_path: Path, mode: str) -> N
 
 
 @pytest.mark.parametrize("mode", ["zip", "w", "w:gz"])
-def test_a_capture_comes_out_as_it_went_in(tmp_path: Path, mode: str) -> None:
+def test_a_capture_is_unpacked_unchanged(tmp_path: Path, mode: str) -> None:
     files = {"scene/transforms_train.json": b"{}", "scene/train/r_0.png": os.urandom(3_000)}
     if mode == "zip":
         archive = zipped(tmp_path / "a", files, compression=zipfile.ZIP_DEFLATED)
     else:
         archive = tarred(tmp_path / "a", *((member(name), content) for name, content in files.items()), mode=mode)
-    found = unpack(archive, tmp_path / "out", LIMITS)
-    assert (found.files, found.bytes, found.skipped) == (2, 3_002, 0)
+    unpacked = unpack(archive, tmp_path / "out", LIMITS)
+    assert (unpacked.files, unpacked.bytes, unpacked.skipped) == (2, 3_002, 0)
     assert {str(p.relative_to(tmp_path / "out")): p.read_bytes() for p in (tmp_path / "out").rglob("*.*")} == files
 
 
-def test_files_that_no_capture_has_are_left_out(tmp_path: Path) -> None:
+def test_files_that_a_capture_does_not_have_are_skipped(tmp_path: Path) -> None:
     files = {"a.json": b"{}", "run.sh": b"#!", "__MACOSX/a.json": b"x", ".git/b.json": b"x", "noending": b"x"}
-    found = unpack(zipped(tmp_path / "a", files), tmp_path / "out", LIMITS)
-    assert (found.files, found.skipped) == (1, 4)
+    unpacked = unpack(zipped(tmp_path / "a", files), tmp_path / "out", LIMITS)
+    assert (unpacked.files, unpacked.skipped) == (1, 4)
     assert [path.name for path in (tmp_path / "out").rglob("*")] == ["a.json"]
 
 
@@ -128,7 +128,7 @@ def test_a_bomb_is_refused_by_its_ratio_and_by_its_size(tmp_path: Path) -> None:
     assert "more than 1000 bytes" in refused(archive, Limits(files=9, bytes=1_000))
 
 
-def test_a_zip_that_lies_about_sizes_is_refused(tmp_path: Path) -> None:
+def test_a_zip_with_wrong_sizes_is_refused(tmp_path: Path) -> None:
     archive = zipped(tmp_path / "a", {"a.json": b"x" * 5_000}, compression=zipfile.ZIP_DEFLATED)
     content = archive.read_bytes()
     claimed = (5_000).to_bytes(4, "little")
@@ -165,10 +165,10 @@ def test_names_that_collide_are_refused(tmp_path: Path) -> None:
     assert "both a file and a folder" in refused(zipped(tmp_path / "a", {"x.json": b"1", "x.json/y.json": b"2"}))
 
 
-def test_what_is_no_archive_or_holds_nothing_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_an_archive_and_an_empty_archive_are_refused(tmp_path: Path) -> None:
     for content, word in (
-        (b"", "no archive"),
-        (b"hello", "no archive"),
+        (b"", "not an archive"),
+        (b"hello", "not an archive"),
         (b"PK\x03\x04", "damaged"),
         (b"\x1f\x8bx", "damaged"),
     ):
@@ -196,7 +196,7 @@ def at_most(size: int) -> Iterator[None]:
 
 
 def header(kind: bytes, size: int, name: str = "x") -> bytes:
-    """The block with which an entry of a tar begins; what follows it is up to the test."""
+    """The header block of an entry of a tar, without its content."""
     info = member(name, kind)
     info.size = size
     return info.tobuf(tarfile.GNU_FORMAT)
@@ -229,8 +229,8 @@ def test_global_headers_count_for_all_entries(tmp_path: Path) -> None:
     assert "extended attributes" in refused(tmp_path / "a")
 
 
-def test_what_headers_say_is_not_kept_beyond_their_entry(tmp_path: Path) -> None:
-    """40 KB for each of 200 entries is allowed, and is not held 200 times."""
+def test_headers_are_discarded_after_their_entry(tmp_path: Path) -> None:
+    """40 KB for each of 200 entries is allowed, and not kept in memory 200 times."""
     with tarfile.open(tmp_path / "a", "w:gz", format=tarfile.PAX_FORMAT) as archive:
         for number in range(200):
             info = member(f"{number}.json")
@@ -241,7 +241,7 @@ def test_what_headers_say_is_not_kept_beyond_their_entry(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("format", [tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
-def test_names_as_long_as_a_path_may_be_come_out(tmp_path: Path, format: int) -> None:
+def test_names_of_the_greatest_length_are_unpacked(tmp_path: Path, format: int) -> None:
     name = "/".join(["d" * 250] * 7) + "/x.json"
     with tarfile.open(tmp_path / "a", "w", format=format) as archive:
         archive.addfile(member(name))
@@ -250,8 +250,8 @@ def test_names_as_long_as_a_path_may_be_come_out(tmp_path: Path, format: int) ->
 
 
 def test_a_sparse_file_is_refused_before_its_map_is_read(tmp_path: Path) -> None:
-    """tarfile keeps the map as a list of numbers, as long as the archive likes."""
-    more = struct.pack("504sB7x", b"00000000001\0" * 42, 1)  # a block of the map, and that another one follows
+    """tarfile keeps the map as a list of numbers, of any length."""
+    more = struct.pack("504sB7x", b"00000000001\0" * 42, 1)  # a block of the map, with the mark that another follows
     first = bytearray(header(tarfile.GNUTYPE_SPARSE, 0, "x.json"))
     first[482] = 1  # the map goes on after the header
     first[148:156] = b"%06o\0 " % tarfile.calc_chksums(bytes(first))[0]  # type: ignore[attr-defined]
@@ -275,7 +275,7 @@ def test_a_file_of_negative_size_is_refused(tmp_path: Path) -> None:
 
 
 def directory(records: int, comment: int, declared: int) -> bytes:
-    """A zip that is nothing but a directory: of `records` entries with `comment` bytes each, said to be `declared`."""
+    """A zip with only a directory: `records` entries with a comment of `comment` bytes each, declared as `declared`."""
     fields = (b"PK\x01\x02", 20, 3, 20, 0, 0, 0, 0, 33, 0, 0, 0, 1, 0, comment, 0, 0, 0, 0)
     record = struct.pack("<4s4B4H3L5H2L", *fields) + b"a" + b"c" * comment
     size = records * len(record)
@@ -295,7 +295,7 @@ def test_a_zip_whose_directory_is_far_too_large_is_refused_before_it_is_read(tmp
         assert "list of entries" in refused(tmp_path / "a")
 
 
-def test_a_zip_of_few_entries_may_say_as_much_of_each_as_the_format_lets_it(tmp_path: Path) -> None:
+def test_a_zip_of_few_entries_may_have_comments_of_the_greatest_length(tmp_path: Path) -> None:
     limits = Limits(files=5, bytes=50)
     with zipfile.ZipFile(tmp_path / "a", "w") as archive:
         for number in range(5):
@@ -306,8 +306,8 @@ def test_a_zip_of_few_entries_may_say_as_much_of_each_as_the_format_lets_it(tmp_
     assert unpack(tmp_path / "a", tmp_path / "out", limits).files == 5
 
 
-def test_a_zip64_with_as_many_entries_as_allowed_comes_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The directory lies elsewhere in it, so that counting in the wrong place would find less."""
+def test_a_zip64_with_as_many_entries_as_allowed_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its directory is at another offset, and counting at the wrong one would find fewer entries."""
     monkeypatch.setattr(zipfile, "ZIP_FILECOUNT_LIMIT", 5)
     archive = zipped(tmp_path / "a", {f"{i}.json": b"{}" for i in range(50)})
     assert b"PK\x06\x06" in archive.read_bytes()
@@ -315,14 +315,14 @@ def test_a_zip64_with_as_many_entries_as_allowed_comes_out(tmp_path: Path, monke
     shutil.rmtree(tmp_path / "out")
     assert "more than 49 entries" in refused(archive, Limits(files=49, bytes=50_000))
     content = bytearray(archive.read_bytes())
-    content[content.rindex(b"PK\x06\x06") + 32] = 1  # and it says that there is one
+    content[content.rindex(b"PK\x06\x06") + 32] = 1  # the declared number of entries
     archive.write_bytes(content)
     with monkeypatch.context() as patch:
-        patch.setattr(zipfile, "ZipFile", None)  # which would find them all
+        patch.setattr(zipfile, "ZipFile", None)  # the entries must be counted before it is used
         assert "more than 49 entries" in refused(archive, Limits(files=49, bytes=50_000))
 
 
-def test_a_name_that_is_not_utf8_is_refused_with_its_remedy(tmp_path: Path) -> None:
+def test_a_name_that_is_not_utf8_is_refused_with_a_remedy(tmp_path: Path) -> None:
     with tarfile.open(tmp_path / "a", "w", format=tarfile.GNU_FORMAT, encoding="latin-1") as archive:
         archive.addfile(member("caf\u00e9.json"))
     message = refused(tmp_path / "a")
@@ -330,13 +330,12 @@ def test_a_name_that_is_not_utf8_is_refused_with_its_remedy(tmp_path: Path) -> N
     message.encode()
 
 
-def test_a_path_that_no_disk_takes_is_refused_with_its_remedy(tmp_path: Path) -> None:
+def test_a_path_that_is_too_long_is_refused_with_a_remedy(tmp_path: Path) -> None:
     name = "/".join(["d" * 255] * 15 + ["e" * 200 + ".json"])
     assert "Use shorter names" in refused(zipped(tmp_path / "a", {name: b"{}"}))
 
 
-def test_a_path_that_is_too_long_only_here_is_refused_with_its_remedy(tmp_path: Path) -> None:
-    """Where the folder of the store lies deep itself."""
+def test_a_path_that_is_too_long_only_in_this_store_is_refused_with_a_remedy(tmp_path: Path) -> None:
     deep = tmp_path.joinpath(*["d" * 250] * 10)
     deep.mkdir(parents=True)
     name = "/".join(["e" * 250] * 7 + ["x.json"])

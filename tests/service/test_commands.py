@@ -1,4 +1,4 @@
-"""The service as a process of its own, with its worker."""
+"""The service as a separate process, with its worker."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LONG_S = 60.0
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
-def test_an_interrupted_service_takes_its_worker_along(tmp_path: Path, number: signal.Signals) -> None:
+def test_an_interrupted_service_stops_its_worker(tmp_path: Path, number: signal.Signals) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -34,8 +34,8 @@ def test_an_interrupted_service_takes_its_worker_along(tmp_path: Path, number: s
                 assert process.poll() is None
             (lease,) = (tmp_path / "workers").iterdir()
             worker = int(lease.stem.split("-")[-2])
-            os.kill(worker, 0)  # it lives
-            assert b"sqlite" not in Path(f"/proc/{worker}/cmdline").read_bytes()  # a password may stand in there
+            os.kill(worker, 0)  # raises if it does not run
+            assert b"sqlite" not in Path(f"/proc/{worker}/cmdline").read_bytes()  # the URL may contain a password
             process.send_signal(number)
             assert process.wait(LONG_S) == 0
             with pytest.raises(ProcessLookupError):
@@ -48,7 +48,7 @@ def test_an_interrupted_service_takes_its_worker_along(tmp_path: Path, number: s
     ("options", "word"),
     [(["--data", f"{__file__}/below"], "below"), (["--database", "foo://bar"], "foo://")],
 )
-def test_a_service_that_cannot_open_its_data_says_so_in_one_line(tmp_path: Path, options: list[str], word: str) -> None:
+def test_a_service_that_cannot_open_its_data_fails_with_one_line(tmp_path: Path, options: list[str], word: str) -> None:
     command = [sys.executable, "-m", "service.commands", "--port", "0", "--data", str(tmp_path), *options]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert ended.returncode == 1
@@ -57,21 +57,19 @@ def test_a_service_that_cannot_open_its_data_says_so_in_one_line(tmp_path: Path,
     assert "--data" in line
 
 
-def test_a_worker_that_refuses_its_arguments_is_not_started_again_and_again(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_worker_that_refuses_its_arguments_is_not_restarted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with WorkerChild(Settings(data=tmp_path), threads=1_000) as child:
-        child._keeper.join(LONG_S)
-        assert not child._keeper.is_alive()
+        child._supervisor.join(LONG_S)
+        assert not child._supervisor.is_alive()
     assert caplog.text.count("refuses") == 1
 
 
 def readiness(port: int) -> dict[str, Any]:
-    """What /readyz says; nothing while nobody listens."""
+    """The response of /readyz; empty while the service does not listen yet."""
     time.sleep(0.1)
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=10) as answer:
-            found: dict[str, Any] = json.load(answer)
-            return found
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=10) as response:
+            document: dict[str, Any] = json.load(response)
+            return document
     except urllib.error.URLError:
         return {}

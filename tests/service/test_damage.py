@@ -1,4 +1,4 @@
-"""What the store holds of one job is damaged: the others are served, and the damaged one can be seen and deleted."""
+"""A damaged job does not hide the others, and can be listed and deleted."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_one_damaged_job_hides_no_other(
     client: TestClient, settings: Settings, job: str, second: str, file: str, content: str
 ) -> None:
     (settings.data / "jobs" / job / file).write_text(content)
-    listed = {one["id"]: one for one in client.get("/jobs").json()["jobs"]}
+    listed = {entry["id"]: entry for entry in client.get("/jobs").json()["jobs"]}
     assert set(listed) == {job, second}
     assert file in listed[job]["error"]
     assert listed[second]["error"] is None
@@ -41,22 +41,20 @@ def test_one_damaged_job_hides_no_other(
 
 
 @pytest.mark.parametrize("line", ["{}", '{"phase": 3}', '{"phase": "joint", "iteration": "many"}'])
-def test_a_report_that_lacks_what_reports_have_is_passed_over(
-    client: TestClient, settings: Settings, job: str, line: str
-) -> None:
+def test_an_invalid_report_is_ignored(client: TestClient, settings: Settings, job: str, line: str) -> None:
     (settings.data / "jobs" / job / "progress.jsonl").write_text(line + "\n")
     assert client.get(f"/jobs/{job}").json()["progress"] is None
 
 
-def test_a_service_starts_with_damaged_jobs_and_strange_files(settings: Settings, archive: bytes) -> None:
+def test_a_service_starts_with_damaged_jobs_and_other_files(settings: Settings, archive: bytes) -> None:
     with TestClient(create_app(settings)) as client:
         damaged, whole = (client.post("/jobs", content=archive).json()["id"] for _ in range(2))
     (settings.data / "jobs" / ".DS_Store").write_text("")
     (settings.data / "jobs" / damaged / "job.json").unlink()
     for file in settings.data.glob("*.sqlite*"):
-        file.unlink()  # the queue forgot both
+        file.unlink()  # the queue has no entry of either job
     with TestClient(create_app(settings)) as client:
-        states = {one["id"]: one["state"] for one in client.get("/jobs").json()["jobs"]}
+        states = {entry["id"]: entry["state"] for entry in client.get("/jobs").json()["jobs"]}
         assert states == {damaged: "failed", whole: "queued"}
         refused = client.post(f"/jobs/{damaged}/retry")
         assert refused.status_code == 409
@@ -64,13 +62,13 @@ def test_a_service_starts_with_damaged_jobs_and_strange_files(settings: Settings
         assert client.delete(f"/jobs/{damaged}").status_code == 204
 
 
-def test_a_job_that_could_not_be_queued_leaves_nothing(
+def test_a_job_that_cannot_be_queued_leaves_no_files(
     client: TestClient, settings: Settings, archive: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def away(*_: object) -> None:
-        raise JobError("The job database is away. Start it.")
+    def unavailable(*_: object) -> None:
+        raise JobError("The job database does not answer. Start it.")
 
-    monkeypatch.setattr(Engine, "enqueue", away)
+    monkeypatch.setattr(Engine, "enqueue", unavailable)
     answer = client.post("/jobs", content=archive)
     assert answer.status_code == 503
     assert "Start it" in answer.json()["detail"]
@@ -78,7 +76,7 @@ def test_a_job_that_could_not_be_queued_leaves_nothing(
     assert list((settings.data / "captures").iterdir()) == []
 
 
-def test_an_image_that_the_store_lost_comes_back_with_the_same_upload(
+def test_a_missing_image_is_restored_by_the_same_upload(
     client: TestClient, settings: Settings, job: str, archive: bytes
 ) -> None:
     images = sorted((settings.data / "captures").rglob("*.png"))
@@ -87,7 +85,7 @@ def test_an_image_that_the_store_lost_comes_back_with_the_same_upload(
     assert sorted((settings.data / "captures").rglob("*.png")) == images
 
 
-def test_a_job_whose_checkpoints_were_removed_is_shown_from_its_compact_model(
+def test_a_job_whose_checkpoints_were_removed_is_rendered_from_its_compact_model(
     client: TestClient, folder: JobFolder, model: str
 ) -> None:
     before = client.get(f"/render?job={model}&t=0.5", headers={"accept": "image/png"})

@@ -1,4 +1,4 @@
-"""A capture is read beside the service, and what goes wrong there is told."""
+"""A capture is read in a separate process, and errors there are reported."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.inspection import inspect_capture
 
 
 class Crash:
-    """Ends the process that receives it, as a bad image ends a bad reader."""
+    """Ends the process that unpickles it, as a malformed image may crash a decoder."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return os._exit, (139,)
@@ -27,18 +27,18 @@ def config() -> CaptureConfig:
     return make_config("draft", {}).capture
 
 
-def test_a_crash_of_the_reader_is_a_complaint_about_the_capture(capture: Path, config: CaptureConfig) -> None:
-    async def crash_and_go_on() -> None:
-        with pytest.raises(CaptureError, match="ended the process") as error:
+def test_a_crash_of_the_reader_is_an_error_in_the_capture(capture: Path, config: CaptureConfig) -> None:
+    async def crash_and_continue() -> None:
+        with pytest.raises(CaptureError, match="ended the reading process") as error:
             await inspect_capture(capture, cast(CaptureConfig, Crash()))
         assert error.value.remedy
         await inspect_capture(capture, config)
 
-    anyio.run(crash_and_go_on)
+    anyio.run(crash_and_continue)
 
 
-def test_a_complaint_keeps_its_parts(tmp_path: Path, config: CaptureConfig) -> None:
-    (tmp_path / "notes.txt").write_text("nothing to see")
+def test_an_error_keeps_its_parts(tmp_path: Path, config: CaptureConfig) -> None:
+    (tmp_path / "notes.txt").write_text("no capture")
     with pytest.raises(CaptureError) as error:
         anyio.run(partial(inspect_capture, tmp_path, config))
     assert error.value.file == "the archive"

@@ -20,7 +20,7 @@ from tests.capture.captures import write_single
 
 
 def problem(answer: Any, status: int) -> dict[str, Any]:
-    """The problem document of an answer."""
+    """The problem document of a response."""
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     document: dict[str, Any] = answer.json()
@@ -29,7 +29,7 @@ def problem(answer: Any, status: int) -> dict[str, Any]:
     return document
 
 
-def left_behind(settings: Settings) -> list[Path]:
+def remaining_files(settings: Settings) -> list[Path]:
     return [path for part in ("uploads", "captures", "jobs") for path in (settings.data / part).iterdir()]
 
 
@@ -80,23 +80,23 @@ def test_a_lone_transforms_file_with_its_points_becomes_a_job(client: TestClient
         ({"name": ""}, "name"),
     ],
 )
-def test_wrong_options_are_refused_by_name(
+def test_wrong_options_are_refused_by_their_name(
     client: TestClient, archive: bytes, settings: Settings, query: dict[str, str], word: str
 ) -> None:
     assert word in problem(client.post("/jobs", params=query, content=archive), 422)["detail"]
-    assert left_behind(settings) == []
+    assert remaining_files(settings) == []
 
 
-def test_wrong_options_in_a_form_are_refused_and_leave_nothing(
+def test_wrong_options_in_a_form_are_refused_without_remaining_files(
     client: TestClient, archive: bytes, settings: Settings
 ) -> None:
     for form in ({"config": "{"}, {"config": '{"iterations": -1}'}, {"config": "[" * 200_000}):
         problem(client.post("/jobs", files={"capture": archive}, data=form), 422)
     assert "capture" in problem(client.post("/jobs", files={"file": archive}), 422)["detail"]
-    assert left_behind(settings) == []
+    assert remaining_files(settings) == []
 
 
-def test_a_bad_archive_is_refused_and_leaves_nothing(client: TestClient, settings: Settings) -> None:
+def test_a_bad_archive_is_refused_without_remaining_files(client: TestClient, settings: Settings) -> None:
     memory = io.BytesIO()
     with zipfile.ZipFile(memory, "w") as archive:
         archive.writestr("good.json", "{}")
@@ -105,11 +105,11 @@ def test_a_bad_archive_is_refused_and_leaves_nothing(client: TestClient, setting
     assert document["type"] == "urn:graings:problem:capture-rejected"
     problem(client.post("/jobs", content=b"hello"), 422)
     problem(client.post("/jobs"), 422)
-    assert left_behind(settings) == []
+    assert remaining_files(settings) == []
 
 
 def repacked(archive: bytes, change: Callable[[str, bytes], bytes | None]) -> bytes:
-    """The archive with each file as `change` makes it; None leaves it out."""
+    """The archive with each file replaced by the result of `change`, without those for which it is None."""
     memory = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(archive)) as source, zipfile.ZipFile(memory, "w") as target:
         for name in source.namelist():
@@ -130,17 +130,17 @@ def repacked(archive: bytes, change: Callable[[str, bytes], bytes | None]) -> by
     ],
     ids=["an image is missing", "a camera is missing", "only images"],
 )
-def test_a_capture_that_training_could_not_begin_on_is_refused_at_once(
+def test_a_capture_that_cannot_be_trained_on_is_refused_at_once(
     client: TestClient, archive: bytes, settings: Settings, change: Callable[[str, bytes], bytes | None], word: str
 ) -> None:
     document = problem(client.post("/jobs", content=repacked(archive, change)), 422)
     assert document["type"] == "urn:graings:problem:bad-capture"
     assert word in document["detail"]
     assert str(settings.data) not in document["detail"]
-    assert left_behind(settings) == []
+    assert remaining_files(settings) == []
 
 
-def test_the_type_of_a_form_is_known_in_any_case(client: TestClient, archive: bytes) -> None:
+def test_the_content_type_of_a_form_is_case_insensitive(client: TestClient, archive: bytes) -> None:
     request = client.build_request("POST", "/jobs", files={"capture": archive})
     request.headers["content-type"] = request.headers["content-type"].replace(
         "multipart/form-data", "Multipart/Form-Data"
@@ -148,33 +148,35 @@ def test_the_type_of_a_form_is_known_in_any_case(client: TestClient, archive: by
     assert client.send(request).status_code == 202
 
 
-def test_a_body_that_is_too_large_is_refused_whether_it_says_so_or_not(client: TestClient, settings: Settings) -> None:
+def test_a_body_that_is_too_large_is_refused_with_or_without_a_content_length(
+    client: TestClient, settings: Settings
+) -> None:
     large = bytes(1_000_001)
     problem(client.post("/jobs", content=large), 413)
     problem(client.post("/jobs", content=iter([large[:600_000], large[:600_000]])), 413)  # chunked
     problem(client.post("/jobs", files={"capture": large}), 413)
     problem(client.post("/jobs/0123456789abcdef/cancel", content=large), 413)
-    assert left_behind(settings) == []
+    assert remaining_files(settings) == []
 
 
 def test_jobs_are_listed_in_pages_newest_first(client: TestClient, archive: bytes) -> None:
     ids = [client.post("/jobs", params={"name": f"n{i}"}, content=archive).json()["id"] for i in range(5)]
-    found, path = [], "/jobs?limit=2"
+    ids_found, path = [], "/jobs?limit=2"
     while path:
         page = client.get(path).json()
         assert len(page["jobs"]) <= 2
-        found += [job["id"] for job in page["jobs"]]
+        ids_found += [job["id"] for job in page["jobs"]]
         path = page["next"]
-    assert found == sorted(ids, reverse=True)
+    assert ids_found == sorted(ids, reverse=True)
     problem(client.get("/jobs?limit=0"), 422)
     problem(client.get("/jobs?cursor=../x"), 422)
 
 
-def test_steering_follows_the_state_and_may_be_repeated(client: TestClient, job: str) -> None:
+def test_cancel_resume_and_retry_depend_on_the_state_and_may_be_repeated(client: TestClient, job: str) -> None:
     def post(verb: str) -> Any:
         return client.post(f"/jobs/{job}/{verb}")
 
-    for verb in ("resume", "retry"):  # it waits already
+    for verb in ("resume", "retry"):  # it is queued already
         assert (post(verb).status_code, post(verb).json()["state"]) == (202, "queued")
     for _ in range(2):
         assert (post("cancel").status_code, post("cancel").json()["state"]) == (202, "cancelled")
@@ -192,7 +194,7 @@ def test_an_unknown_job_is_a_404_everywhere(client: TestClient, job_id: str, pat
     problem(client.get(f"/jobs/{job_id}{path}"), 404)
 
 
-def test_metrics_and_curve_come_when_there_are_any(client: TestClient, job: str, folder: JobFolder) -> None:
+def test_results_of_an_untrained_job_do_not_exist_yet(client: TestClient, job: str, folder: JobFolder) -> None:
     for path in ("metrics", "curve.svg", "report", "report.svg", "model"):
         assert problem(client.get(f"/jobs/{job}/{path}"), 404)["type"] == "urn:graings:problem:not-yet"
         assert path.split(".")[0] not in client.get(f"/jobs/{job}").json()["links"]
@@ -207,9 +209,9 @@ def test_metrics_and_curve_of_a_trained_job(client: TestClient, model: str) -> N
     assert report.json()["schema"] == "graings.work_precision/1"
     assert report.headers["content-type"] == "application/json"
     for address in (links["curve"], f"{links['report']}.svg"):
-        picture = client.get(address)
-        assert picture.headers["content-type"] == "image/svg+xml"
-        assert "<svg" in picture.text
+        image = client.get(address)
+        assert image.headers["content-type"] == "image/svg+xml"
+        assert "<svg" in image.text
 
 
 def test_the_model_of_a_trained_job_is_a_file_that_renders(client: TestClient, model: str, tmp_path: Path) -> None:
@@ -220,7 +222,7 @@ def test_the_model_of_a_trained_job_is_a_file_that_renders(client: TestClient, m
     assert len(read_compact(file).views["train"]) > 0
 
 
-def test_the_log_shows_its_last_lines(client: TestClient, job: str, folder: JobFolder) -> None:
+def test_the_log_has_its_last_lines(client: TestClient, job: str, folder: JobFolder) -> None:
     assert client.get(f"/jobs/{job}/log").text == ""
     folder.log.write_text("one\ntwo\nthree\n")
     assert client.get(f"/jobs/{job}/log").text == "one\ntwo\nthree\n"

@@ -1,4 +1,4 @@
-"""C07: numbers that JSON does not have, in every place where one could come from."""
+"""NaN and infinity, in every place from which they could reach a JSON document."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _refuse(constant: str) -> float:
 
 
 def _floats(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where there are floats in a document."""
+    """The paths of all floats in a document."""
     if isinstance(value, float):
         yield path
     elif isinstance(value, dict):

@@ -22,7 +22,7 @@ def raising(error: Exception) -> TestClient:
     async def fail() -> None:
         raise error
 
-    return TestClient(app)  # errors that get past the handlers are raised in the test
+    return TestClient(app)  # raises errors that no handler answers
 
 
 @pytest.mark.parametrize(
@@ -30,9 +30,9 @@ def raising(error: Exception) -> TestClient:
     [
         (JobNotFound("a"), 404, "no-such-job"),
         (JobConflict("no"), 409, "state-conflict"),
-        (JobError("away"), 503, "jobs-unavailable"),
+        (JobError("no answer"), 503, "jobs-unavailable"),
         (ConfigError("loss.ssim: too large"), 422, "bad-config"),
-        (CaptureError("broken", file="a.png", remedy="Mend it."), 422, "bad-capture"),
+        (CaptureError("broken", file="a.png", remedy="Save it again."), 422, "bad-capture"),
         (CheckpointError("damaged"), 500, "bad-checkpoint"),
         (GraingsError("other"), 500, "graings"),
         (Busy("later"), 503, "busy"),
@@ -40,7 +40,7 @@ def raising(error: Exception) -> TestClient:
         (OSError(errno.ENOSPC, "No space left on device"), 507, "disk-full"),
     ],
 )
-def test_every_error_has_its_status_and_says_itself(error: Exception, status: int, kind: str) -> None:
+def test_every_error_has_its_status_and_message(error: Exception, status: int, kind: str) -> None:
     document = problem(raising(error).get("/"), status)
     assert document["type"] == f"urn:graings:problem:{kind}"
     assert document["instance"] == "/"
@@ -48,13 +48,13 @@ def test_every_error_has_its_status_and_says_itself(error: Exception, status: in
         assert document["detail"] == str(error)
 
 
-@pytest.mark.parametrize(("error", "seconds"), [(Busy("later"), "1"), (JobError("away"), "5")])
-def test_what_is_not_to_be_had_now_says_when_to_come_back(error: Exception, seconds: str) -> None:
+@pytest.mark.parametrize(("error", "seconds"), [(Busy("later"), "1"), (JobError("no answer"), "5")])
+def test_a_temporary_error_has_a_retry_after(error: Exception, seconds: str) -> None:
     assert raising(error).get("/").headers["retry-after"] == seconds
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("secret"), PermissionError("secret"), ValueError(math.nan)])
-def test_what_nobody_foresaw_is_a_problem_too_and_tells_no_secrets(error: Exception) -> None:
+def test_an_unexpected_error_is_a_problem_document_without_its_message(error: Exception) -> None:
     document = problem(raising(error).get("/"), 500)
     assert document["type"] == "about:blank"
     assert "secret" not in str(document)
@@ -69,8 +69,8 @@ def test_the_frameworks_own_errors_are_problem_documents(client: TestClient) -> 
     problem(client.get("/web/none.js"), 404)
 
 
-def test_half_a_character_of_the_client_can_be_quoted(client: TestClient) -> None:
-    """JSON can hold it, UTF-8 cannot."""
+def test_a_lone_surrogate_in_a_request_can_be_quoted(client: TestClient) -> None:
+    """JSON can contain it, UTF-8 cannot."""
     document = problem(raising(GraingsError("cannot read a\ud800b")).get("/"), 500)
     assert document["detail"] == "cannot read a?b"
     document = problem(client.post("/jobs", params={"config": '{"\\ud800": 1}'}), 422)

@@ -12,21 +12,22 @@ import pytest
 from starlette.testclient import TestClient
 
 from graings.camera.camera import Camera
+from graings.camera.view_request import MAX_SIDE
 from graings.camera.viewpoint import orbit_view
 from graings.image_encoding import encode_image
 from graings.render import render
 from graings.storage.checkpoint import load_model
 from jobs.store import JobFolder
 from service.problems import Busy
-from service.scenes import Picture, RenderPool, Scenes
+from service.rendering import ModelCache, RenderPool, RenderRequest
 from service.settings import Settings
 from tests.service.conftest import ITERATIONS, SIZE
 from tests.service.test_jobs import problem
 
 
 def pixels(content: bytes, folder: Path, suffix: str = "png") -> Any:
-    """The picture [H, W, 3] in an answer."""
-    path = folder / f"picture.{suffix}"
+    """The image [H, W, 3] in a response."""
+    path = folder / f"image.{suffix}"
     path.write_bytes(content)
     return oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
 
@@ -43,7 +44,7 @@ def test_a_view_of_the_capture_is_what_the_library_renders(client: TestClient, m
     assert answer.headers["x-graings-finished"] == "true"
 
 
-def test_an_orbit_takes_what_is_not_said_from_the_capture(client: TestClient, model: str, trained: Path) -> None:
+def test_an_orbit_takes_its_defaults_from_the_capture(client: TestClient, model: str, trained: Path) -> None:
     answer = client.get("/render", params={"azimuth": 40})
     loaded = load_model(trained)
     camera = orbit_view(loaded.views["train"], loaded.units, 40.0)
@@ -54,7 +55,7 @@ def test_an_orbit_takes_what_is_not_said_from_the_capture(client: TestClient, mo
     assert again.headers["x-graings-orbit"] == answer.headers["x-graings-orbit"]
 
 
-def test_a_pose_in_the_captures_units_gives_the_same_picture(client: TestClient, model: str, trained: Path) -> None:
+def test_a_pose_in_the_captures_units_gives_the_same_image(client: TestClient, model: str, trained: Path) -> None:
     loaded = load_model(trained)
     camera = loaded.views["val"][0].camera
     pose = json.dumps(loaded.units.camera_back(camera).tolist())
@@ -63,7 +64,7 @@ def test_a_pose_in_the_captures_units_gives_the_same_picture(client: TestClient,
     assert posed.content == client.get("/render", params={"camera": "val:0", "t": 0.5}).content
 
 
-def test_a_named_view_brings_its_own_time(client: TestClient, model: str, trained: Path) -> None:
+def test_a_named_view_has_its_own_time(client: TestClient, model: str, trained: Path) -> None:
     time = load_model(trained).views["train"][5].time
     assert time == 1.0
     alone = client.get("/render", params={"camera": "train:5"})
@@ -75,44 +76,51 @@ def test_a_named_view_brings_its_own_time(client: TestClient, model: str, traine
     ("query", "size"),
     [({}, (24, 24)), ({"width": 48}, (48, 48)), ({"height": 12}, (12, 12)), ({"width": 30, "height": 10}, (30, 10))],
 )
-def test_one_length_keeps_the_shape(
+def test_one_length_keeps_the_aspect_ratio(
     client: TestClient, model: str, tmp_path: Path, query: dict[str, int], size: tuple[int, int]
 ) -> None:
-    picture = pixels(client.get("/render", params={"camera": "val:0", **query}).content, tmp_path)
-    assert picture.shape == (size[1], size[0], 3)
+    image = pixels(client.get("/render", params={"camera": "val:0", **query}).content, tmp_path)
+    assert image.shape == (size[1], size[0], 3)
 
 
-def test_the_background_is_what_was_asked_for(client: TestClient, model: str, tmp_path: Path) -> None:
-    query = {"azimuth": 0, "elevation": 0, "radius": 1_000}  # so far off that nothing else is seen
+def test_the_background_is_the_requested_one(client: TestClient, model: str, tmp_path: Path) -> None:
+    query = {"azimuth": 0, "elevation": 0, "radius": 1_000}  # so far away that only the background is visible
     for background, rgb in (("white", (1, 1, 1)), ("black", (0, 0, 0)), ("1,0,0.2", (1, 0, 0.2))):
         corner = pixels(client.get("/render", params={**query, "background": background}).content, tmp_path)[0, 0]
         np.testing.assert_allclose(corner, rgb, atol=0.5 / 255)
 
 
 @pytest.mark.parametrize(
-    ("accept", "format", "media", "begins"),
+    ("accept", "format", "media", "start"),
     [
         ("*/*", None, "image/png", b"\x89PNG"),
         ("image/webp", None, "image/webp", b"RIFF"),
-        ("image/jpeg, image/png;q=0.5", None, "image/jpeg", b"\xff\xd8"),
+        ("image/png;q=0.5, image/jpeg;q=0.8", None, "image/jpeg", b"\xff\xd8"),
+        ("image/png;q=0, image/*", None, "image/jpeg", b"\xff\xd8"),
+        ("image/*;q=0.3, */*;q=0.9", None, "image/png", b"\x89PNG"),
+        ("image/avif,image/webp,*/*;q=0.8", None, "image/webp", b"RIFF"),
+        ("IMAGE/WEBP ; Q=1", None, "image/webp", b"RIFF"),
+        ("image/png;q=x, image/jpeg;q=0.1", None, "image/jpeg", b"\xff\xd8"),
+        ("", None, "image/png", b"\x89PNG"),
         ("image/x-exr", None, "image/x-exr", b"\x76\x2f\x31\x01"),
         ("text/html", "jpeg", "image/jpeg", b"\xff\xd8"),
     ],
 )
 def test_the_format_is_negotiated(
-    client: TestClient, model: str, accept: str, format: str | None, media: str, begins: bytes
+    client: TestClient, model: str, accept: str, format: str | None, media: str, start: bytes
 ) -> None:
     answer = client.get("/render", params={"format": format} if format else {}, headers={"Accept": accept})
     assert answer.headers["content-type"] == media
     assert answer.headers["vary"] == "Accept"
-    assert answer.content.startswith(begins)
+    assert answer.content.startswith(start)
 
 
-def test_no_acceptable_format_is_said_before_anything_is_loaded(client: TestClient) -> None:
-    assert "image/png" in problem(client.get("/render", headers={"Accept": "text/html"}), 406)["detail"]
+def test_without_an_acceptable_format_the_request_fails_before_a_model_is_loaded(client: TestClient) -> None:
+    for accept in ("text/html", "image/png;q=0", "image/png;q=nan"):
+        assert "image/png" in problem(client.get("/render", headers={"Accept": accept}), 406)["detail"]
 
 
-def test_a_picture_the_client_has_is_not_sent_again(client: TestClient, model: str) -> None:
+def test_an_unchanged_image_is_not_sent_again(client: TestClient, model: str) -> None:
     first = client.get("/render", params={"t": 0.25})
     etag = first.headers["etag"]
     assert etag.startswith('"')
@@ -143,7 +151,7 @@ POSE = json.dumps(np.eye(4).tolist())
         ({"t": "inf"}, "t"),
         ({"t": "soon"}, "t"),
         ({"width": "0"}, "width"),
-        ({"width": "4097"}, "width"),
+        ({"width": str(MAX_SIDE + 1)}, "width"),
         ({"elevation": "91"}, "elevation"),
         ({"fov": "180"}, "fov"),
         ({"radius": "0"}, "radius"),
@@ -157,7 +165,8 @@ POSE = json.dumps(np.eye(4).tolist())
         ({"camera": "nowhere:0"}, "nowhere"),
         ({"camera": "val:0", "azimuth": "1"}, "one viewpoint"),
         ({"camera": "val:0", "fx": "1"}, "one viewpoint"),
-        ({"pose": POSE}, "fx"),
+        ({"pose": POSE}, "fx, width, height missing"),
+        ({"fx": "9", "width": "9", "height": "9"}, "world_to_camera missing"),
         ({"pose": "[[1]]", "fx": "9", "width": "9", "height": "9"}, "shape"),
         ({"pose": "[[NaN", "fx": "9", "width": "9", "height": "9"}, "pose"),
         ({"pose": POSE.replace("1.0", "NaN"), "fx": "9", "width": "9", "height": "9"}, "finite"),
@@ -167,30 +176,28 @@ POSE = json.dumps(np.eye(4).tolist())
         ({"azimut": "30"}, "azimut"),
     ],
 )
-def test_a_parameter_that_makes_no_sense_is_named(
-    client: TestClient, model: str, query: dict[str, str], word: str
-) -> None:
+def test_an_invalid_parameter_is_named(client: TestClient, model: str, query: dict[str, str], word: str) -> None:
     assert word in problem(client.get("/render", params=query), 422)["detail"]
 
 
-def test_a_side_that_would_become_too_long_to_keep_the_shape_is_refused(
+def test_a_side_that_the_aspect_ratio_makes_too_long_is_refused(
     client: TestClient, model: str, folder: JobFolder
 ) -> None:
     facts = folder.run / "checkpoints" / f"{ITERATIONS:08d}" / "checkpoint.json"
     document = json.loads(facts.read_text())
     document["views"]["val"][0]["size"] = [SIZE, 1]
     facts.write_text(json.dumps(document))
-    wide = {"camera": "val:0", "height": 200}
-    assert "4800x200" in problem(client.get("/render", params=wide), 422)["detail"]
+    wide = {"camera": "val:0", "height": 400}
+    assert "9600x400" in problem(client.get("/render", params=wide), 422)["detail"]
 
 
-def test_without_a_model_there_is_nothing_to_see_yet(client: TestClient, job: str) -> None:
+def test_without_a_model_there_is_no_image_yet(client: TestClient, job: str) -> None:
     for query in ({}, {"job": job}):
         assert problem(client.get("/render", params=query), 404)["type"] == "urn:graings:problem:not-yet"
     problem(client.get("/render", params={"job": "0123456789abcdef"}), 404)
 
 
-def test_the_newest_job_that_has_a_model_is_shown(client: TestClient, model: str, archive: bytes) -> None:
+def test_the_newest_job_with_a_model_is_rendered(client: TestClient, model: str, archive: bytes) -> None:
     newer = client.post("/jobs", content=archive).json()["id"]
     assert newer > model
     assert client.get("/render").headers["x-graings-job"] == model
@@ -213,37 +220,37 @@ def test_a_damaged_checkpoint_hides_neither_the_one_before_nor_other_jobs(
 
 def test_a_model_is_loaded_once_until_its_checkpoint_changes(trained: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(trained, tmp_path / "run"))
-    scenes = Scenes(models=1)
-    first = scenes.load(run)
+    models = ModelCache(capacity=1)
+    first = models.load(run)
     assert first is not None
-    assert scenes.load(run) is first
+    assert models.load(run) is first
     (run / "checkpoints" / f"{ITERATIONS:08d}").rename(run / "checkpoints" / f"{ITERATIONS + 1:08d}")
-    second = scenes.load(run)
+    second = models.load(run)
     assert second is not None
     assert second is not first
     other = shutil.copytree(trained, tmp_path / "other")
-    assert scenes.load(Path(other)) is not None
-    assert scenes.load(run) is not second  # the other one took its place
+    assert models.load(Path(other)) is not None
+    assert models.load(run) is not second  # discarded for the other one
 
 
-def test_who_finds_too_many_waiting_is_turned_away_at_once(trained: Path) -> None:
+def test_a_request_beyond_the_limit_is_refused_at_once(trained: Path) -> None:
     pool = RenderPool(slots=1, waiting=1)
     model = load_model(trained)
     camera = Camera.orbit(0.0, 0.0, 3.0, fov=0.7, width=8, height=8)
-    picture = Picture(camera, 0.0, (1.0, 1.0, 1.0), "png")
+    request = RenderRequest(camera, 0.0, (1.0, 1.0, 1.0), "png")
     answers: list[str] = []
 
-    async def ask() -> None:
+    async def send() -> None:
         try:
-            await pool.draw(model, picture)
-            answers.append("drawn")
+            await pool.render(model, request)
+            answers.append("rendered")
         except Busy:
             answers.append("busy")
 
     async def all_at_once() -> None:
         async with anyio.create_task_group() as group:
             for _ in range(5):
-                group.start_soon(ask)
+                group.start_soon(send)
 
     anyio.run(all_at_once)
-    assert answers == ["busy"] * 3 + ["drawn"] * 2
+    assert answers == ["busy"] * 3 + ["rendered"] * 2

@@ -23,10 +23,10 @@ def test_the_options_are_those_of_training(client: TestClient) -> None:
 
 def test_health_and_readiness(client: TestClient, job: str, settings: Settings) -> None:
     assert client.get("/healthz").json() == {"status": "ok"}
-    found = client.get("/readyz").json()
-    assert (found["ready"], found["workers"], found["waiting"]) == (True, 0, 1)
+    readiness = client.get("/readyz").json()
+    assert (readiness["ready"], readiness["workers"], readiness["waiting"]) == (True, 0, 1)
     leases = FileLeases(Store(settings.data).workers)
-    assert leases.take("worker-a")
+    assert leases.acquire("worker-a")
     assert client.get("/readyz").json()["workers"] == 1
     leases.close()
 
@@ -38,7 +38,7 @@ def test_a_full_disk_is_not_ready(settings: Settings) -> None:
         assert answer.headers["retry-after"] == "5"
 
 
-def test_the_page_needs_nothing_from_anywhere_else(client: TestClient) -> None:
+def test_the_page_loads_nothing_from_other_sites(client: TestClient) -> None:
     page = client.get("/")
     assert page.headers["content-type"].startswith("text/html")
     assert "default-src 'self'" in page.headers["content-security-policy"]
@@ -52,13 +52,15 @@ def test_the_page_needs_nothing_from_anywhere_else(client: TestClient) -> None:
 
 
 def test_every_operation_is_named_and_every_error_described(client: TestClient) -> None:
-    operations = [one for path in client.get("/openapi.json").json()["paths"].values() for one in path.values()]
-    names = [one["operationId"] for one in operations]
+    operations = [
+        operation for path in client.get("/openapi.json").json()["paths"].values() for operation in path.values()
+    ]
+    names = [operation["operationId"] for operation in operations]
     assert len(set(names)) == len(names) >= 15
     assert all(re.fullmatch("[a-z_]+", name) for name in names)
 
 
-def test_settings_come_from_the_environment_and_what_is_given_wins() -> None:
+def test_settings_come_from_the_environment_unless_given() -> None:
     settings = Settings.from_environment(
         {"GRAINGS_PORT": "81", "GRAINGS_HOST": "::1", "OTHER": "x"}, port=82, host=None
     )
@@ -68,7 +70,7 @@ def test_settings_come_from_the_environment_and_what_is_given_wins() -> None:
         Settings.from_environment({"GRAINGS_RENDER_SLOTS": "none"})
 
 
-def test_the_service_listens_to_this_machine_only_unless_told() -> None:
+def test_by_default_the_service_listens_only_on_this_machine() -> None:
     assert Settings().host == "127.0.0.1"
 
 
@@ -77,3 +79,11 @@ def test_the_documentation_lists_every_setting_with_its_default() -> None:
     for name, field in Settings.model_fields.items():
         default = "" if field.default is None else f"`{field.default}`"
         assert f"| `{name}` | {default} | {field.description} |" in text
+
+
+def test_the_documentation_lists_every_route(client: TestClient) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "api.md").read_text()
+    paths = client.get("/openapi.json").json()["paths"]
+    routes = [(method.upper(), path.replace("{job_id}", "{id}")) for path in paths for method in paths[path]]
+    assert len(routes) > 15
+    assert [route for route in routes if f"`{route[0]} {route[1]}" not in text] == []

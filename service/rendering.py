@@ -1,7 +1,7 @@
-"""Scenes: loaded models and the pool that draws them.
+"""Rendering: loaded models, and a pool of threads that renders images of them.
 
-Models are kept by what their file holds, the least recently used one leaves; images are drawn in a few threads,
-and who finds too many waiting is turned away at once. Knows nothing of requests.
+Models are identified by path and modification time; the least recently used one is discarded. If too many requests wait
+for a thread, further ones are refused at once.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _Key = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """Everything that decides what an image looks like, but for the model. `time` in [0, 1]."""
+class RenderRequest:
+    """Everything an image depends on, except the model. `time` is in [0, 1], `background` is RGB in [0, 1]."""
 
     camera: Camera
     time: float
@@ -36,17 +36,17 @@ class Picture:
     format: ImageFormat
 
 
-class Scenes:
-    """The models in memory, at most `models` of them. `load` may be called from several threads."""
+class ModelCache:
+    """At most `capacity` models in memory. `load` may be called from several threads."""
 
-    def __init__(self, models: int) -> None:
-        self._models = models
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
         self._loaded: OrderedDict[_Key, Model] = OrderedDict()
         self._guard = threading.Lock()
 
     def load(self, run: Path) -> Model | None:
-        """The model of a run folder, in its newest checkpoint that can be read, or None. Raises `CheckpointError`."""
-        # One at a time: two requests for the same new checkpoint should read it once.
+        """The model of a run folder, from its newest readable checkpoint, or None. Raises `CheckpointError`."""
+        # One at a time, so that two requests for the same new checkpoint read it once.
         with self._guard:
             newest = newest_model(run)
             if newest is None:
@@ -59,49 +59,50 @@ class Scenes:
                 except CheckpointError:
                     if newest_model(run) == newest:
                         raise
-                    model = open_model(run)  # training went on and removed this one while it was read
+                    model = open_model(run)  # training removed this checkpoint while it was read
                 if newest_model(run) != newest:
                     key = _key(model.path)
                 if key:
-                    self._forget(newest.parent)
+                    self._discard(newest.parent)
                     self._loaded[key] = model
             if key:
                 self._loaded.move_to_end(key)
-            while len(self._loaded) > self._models:
+            while len(self._loaded) > self._capacity:
                 self._loaded.popitem(last=False)
             return model
 
-    def _forget(self, folder: Path) -> None:
-        """Older models of the same run are not asked for again."""
+    def _discard(self, folder: Path) -> None:
+        """Discard the older models of the same run."""
         for key in [key for key in self._loaded if Path(key[0]).parent == folder]:
             del self._loaded[key]
 
 
 class RenderPool:
-    """Draws images, `slots` at a time; at most `waiting` more may wait."""
+    """Renders images, `slots` at a time; at most `waiting` further requests may wait."""
 
     def __init__(self, slots: int, waiting: int) -> None:
         self._limiter = CapacityLimiter(slots)
-        self._most = slots + waiting
-        self._inside = 0
+        self._max_requests = slots + waiting
+        self._requests = 0
 
-    async def draw(self, model: Model, picture: Picture) -> bytes:
+    async def render(self, model: Model, request: RenderRequest) -> bytes:
         """The encoded image. Raises `Busy`."""
-        if self._inside >= self._most:
+        if self._requests >= self._max_requests:
             raise Busy("Too many images are being rendered. Try again in a moment.")
-        self._inside += 1
+        self._requests += 1
         try:
-            return await to_thread.run_sync(self._draw, model, picture, limiter=self._limiter)
+            return await to_thread.run_sync(_rendered, model, request, limiter=self._limiter)
         finally:
-            self._inside -= 1
+            self._requests -= 1
 
-    def _draw(self, model: Model, picture: Picture) -> bytes:
-        result = render(model.scene, picture.camera, picture.time, picture.background)
-        return encode_image(np.asarray(result.color, dtype=np.float32), picture.format)
+
+def _rendered(model: Model, request: RenderRequest) -> bytes:
+    result = render(model.scene, request.camera, request.time, request.background)
+    return encode_image(np.asarray(result.color, dtype=np.float32), request.format)
 
 
 def _key(path: Path) -> _Key | None:
-    """What tells this file or folder from any other that is or was in its place; None when it is gone."""
+    """The path with its modification time; None if it no longer exists."""
     try:
         return str(path), path.stat().st_mtime_ns
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The service while its PostgreSQL is away: what needs it says so at once, everything else is served."""
+"""While PostgreSQL is stopped, requests that need it fail at once, and all others are answered."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from tests.service.test_jobs import problem
 
 pytestmark = pytest.mark.slow
 
-# More than the service has threads.
-MANY = 60
+REQUESTS = 60  # more than the service has threads
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def settings(settings: Settings, server: Server) -> Settings:
 
 def test_the_service_is_ready_again_after_a_restart_of_the_database(client: TestClient, server: Server) -> None:
     assert client.get("/readyz").status_code == 200
-    with server.away():
+    with server.stopped():
         answer = client.get("/readyz")
         assert "does not answer" in problem(answer, 503)["detail"]
         assert answer.headers["retry-after"] == "5"
@@ -39,10 +38,10 @@ def test_the_service_is_ready_again_after_a_restart_of_the_database(client: Test
     assert client.get("/readyz").json()["ready"]
 
 
-def test_requests_that_need_the_database_do_not_keep_the_others_waiting(client: TestClient, server: Server) -> None:
+def test_requests_that_need_the_database_do_not_delay_others(client: TestClient, server: Server) -> None:
     assert client.get("/jobs").json()["jobs"] == []
-    with ThreadPoolExecutor(MANY) as pool, server.away():
-        answers = [pool.submit(client.get, f"/jobs/{number:016x}") for number in range(MANY)]
+    with ThreadPoolExecutor(REQUESTS) as pool, server.stopped():
+        answers = [pool.submit(client.get, f"/jobs/{number:016x}") for number in range(REQUESTS)]
         assert pool.submit(client.get, "/options").result(20).status_code == 200
         assert {answer.result(20).status_code for answer in answers} == {503}
     assert client.get(f"/jobs/{0:016x}").status_code == 404
