@@ -21,17 +21,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from graings.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
+
 Image = NDArray[np.float64]
 
 # Two equal images have no error to take a logarithm of: below this mean squared error PSNR reads 100 dB.
 MSE_FLOOR: Final = 1e-10
 PSNR_CAP: Final = 100.0
-
-# SSIM as 3D Gaussian Splatting defines it, for values in [0, 1]: (0.01)^2 and (0.03)^2.
-SSIM_WINDOW: Final = 11
-SSIM_SIGMA: Final = 1.5
-SSIM_C1: Final = 1e-4
-SSIM_C2: Final = 9e-4
 
 # VGG halves the image five times: below this side nothing is left to compare.
 LPIPS_MIN_SIDE: Final = 32

@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from graings.constants import SSIM_C2
 from graings.raster.photometric import photometric, ssim
-from graings.raster.photometric_reference import C2
 from graings.raster.rasterize import rasterize
 from tests.raster.comparison import BACKGROUND, UNIT_ROUNDOFF
 from tests.scenes import FLOATS, cast, overlapping
@@ -83,7 +83,7 @@ def test_a_picture_that_equals_its_target_moves_nothing(weight: float, dtype: to
         assert value.item() == 0
         assert all((gradient == 0).all() for gradient in gradients.values())
     # 24 roundings of moments <= 1, seen through the smallest divisor C2, as in `test_photometric`
-    bound = 24 * (UNIT_ROUNDOFF if dtype == torch.float32 else 2.0**-53) / C2
+    bound = 24 * (UNIT_ROUNDOFF if dtype == torch.float32 else 2.0**-53) / SSIM_C2
     assert abs(value.item()) <= weight * bound
     # what one grey level of noise would send back is the measure of a gradient that should not be there
     noise = torch.randn(color.shape, generator=torch.Generator().manual_seed(0), dtype=dtype) / 255

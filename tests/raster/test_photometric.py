@@ -8,6 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from graings import kernel
+from graings.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from graings.raster import photometric_reference
 from graings.raster.photometric import photometric, ssim
 from tests.raster.comparison import UNIT_ROUNDOFF, relative
@@ -31,6 +33,15 @@ def with_gradient(
     return value.detach(), gradient
 
 
+def test_the_kernel_is_compiled_with_the_constants_of_ssim() -> None:
+    constants = kernel.kernel().ssim_constants()
+    assert (constants["c1"], constants["c2"]) == (SSIM_C1, SSIM_C2)
+    distances = torch.arange(SSIM_WINDOW // 2 + 1, dtype=torch.float64)
+    taps = torch.exp(-distances.square() / (2 * SSIM_SIGMA**2))
+    taps /= taps[0] + 2 * taps[1:].sum()
+    torch.testing.assert_close(torch.tensor(constants["taps"], dtype=torch.float64), taps, rtol=1e-15, atol=0)
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_double_precision_equals_a_plain_convolution(size: tuple[int, int], isa: str) -> None:
     value, gradient = with_gradient(ssim, *pair(*size))
@@ -45,7 +56,7 @@ def test_single_precision_stays_close_to_double(size: tuple[int, int], isa: str)
     value, gradient = with_gradient(ssim, image, target)
     expected, expected_gradient = with_gradient(photometric_reference.ssim, image.double(), target.double())
     # Two passes of 11 products in [0, 1]: 24 roundings of moments <= 1, seen through the smallest divisor C2 = 9e-4.
-    bound = 24 * UNIT_ROUNDOFF / photometric_reference.C2
+    bound = 24 * UNIT_ROUNDOFF / SSIM_C2
     assert abs(value.double() - expected).item() <= bound
     assert relative(gradient, expected_gradient) <= bound
 
@@ -134,7 +145,7 @@ def test_what_is_equal_is_left_out_and_changes_nothing(
         expected, expected_gradient = with_gradient(plain, image, target)
         torch.testing.assert_close(value, expected, rtol=0, atol=1e-12)
         # The oracle's own rounding where nothing differs: 24 moments <= 1 through the smallest divisor C2, in float64.
-        noise = 24 * 2.0**-53 / photometric_reference.C2 / image.numel()
+        noise = 24 * 2.0**-53 / SSIM_C2 / image.numel()
         assert ((gradient - expected_gradient).abs() <= 1e-12 * expected_gradient.abs().max() + noise).all()
 
 

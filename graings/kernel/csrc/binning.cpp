@@ -11,9 +11,9 @@ namespace graings {
 
 namespace {
 
-constexpr int64_t kMostEntries = 1 << 24;  // of a tile: their numbers are kept in R
-constexpr int64_t kFew = 24;               // sorted by comparison alone
-constexpr int kLongestDigit = 11;
+constexpr int64_t kMaxEntries = 1 << 24;  // of a tile: their numbers are kept in R
+constexpr int64_t kMaxInsertionSort = 24;               // sorted by comparison alone
+constexpr int kMaxDigitBits = 11;
 
 uint64_t bits_of_depth(double depth) { return std::bit_cast<uint64_t>(depth); }  // positive: ordered like the numbers
 
@@ -23,7 +23,7 @@ bool is_small(const Span& span) { return span.count <= 16; }
 // Tiles that a record may touch, row by row: visit(row of tiles, first tile column, last one).
 template <class R, class Visit>
 void each_tile_row(const Record<R>& record, const Span& span, int64_t width, Visit visit) {
-    const double sr = double(record.look.sr), sy = double(record.look.sy), level = double(record.look.level), steep = record.slope * sr;
+    const double sr = double(record.params.sr), sy = double(record.params.sy), level = double(record.params.level), steep = record.slope * sr;
     const double highest = std::sqrt(level) / sy, turn = highest * steep / std::sqrt(steep * steep + sy * sy);
     for (uint32_t row = span.first_row(); row <= span.last_row(); row++) {
         const double low = std::max(double(row * kTile) + 0.5 - record.y, -highest);
@@ -105,7 +105,7 @@ void Binning<R>::enter(const std::vector<Piece>& pieces) {
         begin[size_t(tile)] = total;
         for (auto& counts : counts_)  // from now on where the worker's next pair goes
             if (!counts.empty()) total += std::exchange(counts[size_t(tile)], uint32_t(total));
-        if (total - begin[size_t(tile)] > kMostEntries) throw std::length_error("more than 2^24 Gaussians on one tile");
+        if (total - begin[size_t(tile)] > kMaxEntries) throw std::length_error("more than 2^24 Gaussians on one tile");
     }
     begin[size_t(tiles_)] = total;
     places[pieces.empty() ? 0 : size_t(pieces.back().end)] = uint32_t(total);
@@ -177,14 +177,14 @@ void Binning<R>::sort(Pair* pairs, int64_t count, std::vector<Pair>& half) const
         if (a.key != b.key) return a.key < b.key;
         return std::tuple(depths_[a.id], uids_[a.id], a.id) < std::tuple(depths_[b.id], uids_[b.id], b.id);
     };
-    if (count > kFew) {
+    if (count > kMaxInsertionSort) {
         if (int64_t(half.size()) < count) half.resize(size_t(2 * count));
         uint32_t least = ~uint32_t(0), most = 0;
         for (int64_t i = 0; i < count; i++) least = std::min(least, pairs[i].key), most = std::max(most, pairs[i].key);
-        const int digit = std::min(int(std::bit_width(uint64_t(count))) - 1, kLongestDigit), bins = 1 << digit;
+        const int digit = std::min(int(std::bit_width(uint64_t(count))) - 1, kMaxDigitBits), bins = 1 << digit;
         const int shift = std::max(int(std::bit_width(most - least)) - 2 * digit, 0);
         const auto lead = [&](uint32_t key) { return (key - least) >> shift; };
-        uint32_t low[1 << kLongestDigit], high[1 << kLongestDigit];
+        uint32_t low[1 << kMaxDigitBits], high[1 << kMaxDigitBits];
         std::fill_n(low, bins, 0), std::fill_n(high, bins, 0);
         for (int64_t i = 0; i < count; i++) {
             const uint32_t l = lead(pairs[i].key);

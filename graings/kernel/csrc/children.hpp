@@ -8,7 +8,7 @@ namespace graings {
 template <class R>
 struct Anchors {
     int64_t count, slots;
-    const R *place, *log_scale, *offset;  // [count, 3], [count, 3], [count * slots, 3]
+    const R *position, *log_scale, *offset;  // [count, 3], [count, 3], [count * slots, 3]
 };
 
 // row [drawn, 3 + slots]: offset, and a one at the child's slot; centre [drawn, 3] = place + exp(log_scale) * offset
@@ -28,10 +28,10 @@ struct ScaleBounds {
 };
 
 template <class R>
-struct Answers {
+struct NetworkOutputs {
     int64_t drawn;
     const R *canonical, *base, *centre;  // [drawn, 7]: quaternion less the identity, log-scale less base; [drawn, 3] each
-    const R* moved;                      // [drawn, 10]: position in units of `extent`, rotation, log-scale; or null
+    const R* deformation;                      // [drawn, 10]: position in units of `extent`, rotation, log-scale; or null
     double extent;
     ScaleBounds bounds;
 };
@@ -39,11 +39,11 @@ struct Answers {
 // mean [drawn, 3] = centre + extent * position; quat [drawn, 4] = unit(1 + canonical) times 1 + rotation;
 // log_scale [drawn, 3] = base + canonical + change, both bounded (Eq. 5 and 10).
 template <class R>
-void compose(const Answers<R>&, R* mean, R* quat, R* log_scale, int threads);
+void compose(const NetworkOutputs<R>&, R* mean, R* quat, R* log_scale, int threads);
 
 // The adjoint; v_moved is null where there is no `moved`. The gradient of base is that of log_scale's canonical part,
 // that of centre is v_mean itself.
 template <class R>
-void compose_gradient(const Answers<R>&, const R* v_mean, const R* v_quat, const R* v_log_scale, R* v_canonical, R* v_moved, int threads);
+void compose_gradient(const NetworkOutputs<R>&, const R* v_mean, const R* v_quat, const R* v_log_scale, R* v_canonical, R* v_deformation, int threads);
 
 }  // namespace graings

@@ -55,7 +55,7 @@ Frame<R>::Frame(const Camera& camera, const Settings& settings, const Inputs<R>&
       tiles_(pieces_of(camera.width, kTile) * pieces_of(camera.height, kTile)), status_(size_t(in.count)),
       records_(size_t(in.count)) {
     if (count_ > int64_t(std::numeric_limits<uint32_t>::max())) throw std::invalid_argument("more than 2^32 Gaussians");
-    if (std::max(camera.width, camera.height) > kLongestSide) throw std::invalid_argument("an image may be at most " + std::to_string(kLongestSide) + " pixels wide and high");
+    if (std::max(camera.width, camera.height) > kMaxImageSide) throw std::invalid_argument("an image may be at most " + std::to_string(kMaxImageSide) + " pixels wide and high");
     Stopwatch watch;
     const size_t depths_end = whole_lines(size_t(count_) * sizeof(double)), light_end = size_t(tiles_) * kBlocks * kLanes * sizeof(R);
     scratch_ = Buffer<std::byte>(std::max(depths_end + size_t(count_) * sizeof(Span), gradient ? 2 * light_end : 0));
@@ -121,14 +121,14 @@ void Frame<R>::pixels_gradient(const R* background, const R* v_color, const R* v
     if (!light_) throw std::logic_error("this frame was drawn without a gradient in mind, or has given it already");
     Stopwatch watch;
     sums_ = Buffer<R>(size_t(shown_) * kSumStride);
-    Buffer<double> grounds(v_background ? size_t(tiles_) * 3 : 0);
-    const TileGradientArgs<R> tiles{tile_args(background), v_color, v_alpha, v_depth, ranks_.get(), sums_.get(), v_background ? grounds.get() : nullptr};
+    Buffer<double> tile_backgrounds(v_background ? size_t(tiles_) * 3 : 0);
+    const TileGradientArgs<R> tiles{tile_args(background), v_color, v_alpha, v_depth, ranks_.get(), sums_.get(), v_background ? tile_backgrounds.get() : nullptr};
     each_tile(threads, tiles_, [&](int, int64_t tile, int64_t) { kernels<R>().tile_gradient(tiles, tile); });
     if (v_background) {
-        double ground[3] = {};
+        double background_sum[3] = {};
         for (int64_t tile = 0; tile < tiles_; tile++)
-            for (int c = 0; c < 3; c++) ground[c] += grounds[size_t(3 * tile + c)];
-        for (int c = 0; c < 3; c++) v_background[c] = R(ground[c]);
+            for (int c = 0; c < 3; c++) background_sum[c] += tile_backgrounds[size_t(3 * tile + c)];
+        for (int c = 0; c < 3; c++) v_background[c] = R(background_sum[c]);
     }
     records_ = {}, pairs_ = {}, scratch_ = {}, light_ = last_ = nullptr;
     seconds_[kBlendGradient] = watch.lap();

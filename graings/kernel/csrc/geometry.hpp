@@ -15,7 +15,7 @@ constexpr double kLog2E = 1.4426950408889634;
 
 // Everything about eight Gaussians that both directions need.
 struct Projected {
-    D z, inverse_z, ratio_x, ratio_y, held_x, held_y;  // held: clamped before the Jacobian
+    D z, inverse_z, ratio_x, ratio_y, clamped_x, clamped_y;  // held: clamped before the Jacobian
     D quat[4], squared, inverse_squared;
     D rotation[9], scale[3];
     D affine[6];      // Jacobian times world-to-camera rotation, 2x3
@@ -58,8 +58,8 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
     p.inverse_z = d8(1) / p.z;
     p.ratio_x = camera[0] * p.inverse_z;
     p.ratio_y = camera[1] * p.inverse_z;
-    p.held_x = clamp(p.ratio_x, limit.low_x, limit.high_x);
-    p.held_y = clamp(p.ratio_y, limit.low_y, limit.high_y);
+    p.clamped_x = clamp(p.ratio_x, limit.low_x, limit.high_x);
+    p.clamped_y = clamp(p.ratio_y, limit.low_y, limit.high_y);
 
     p.squared = fma(p.quat[0], p.quat[0], fma(p.quat[1], p.quat[1], fma(p.quat[2], p.quat[2], p.quat[3] * p.quat[3])));
     p.finite = p.finite + (p.squared - p.squared);
@@ -74,8 +74,8 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
     const D fx = d8(k.fx) * p.inverse_z, fy = d8(k.fy) * p.inverse_z;
     for (int i = 0; i < 3; i++) {
         const D forward = d8(k.rotation[6 + i]);
-        p.affine[i] = fx * (d8(k.rotation[i]) - p.held_x * forward);
-        p.affine[3 + i] = fy * (d8(k.rotation[3 + i]) - p.held_y * forward);
+        p.affine[i] = fx * (d8(k.rotation[i]) - p.clamped_x * forward);
+        p.affine[3 + i] = fy * (d8(k.rotation[3 + i]) - p.clamped_y * forward);
     }
     for (int j = 0; j < 3; j++) {
         const D* a = p.affine;
@@ -113,19 +113,19 @@ static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
         D log_opacity = log2<R>(opacity), level = s.alpha_min > 0 ? log_opacity - faintest : d8(1e30), root = sqrt(max(level, zero));
         Projected p = project_group(args.camera, s, limit, in, group);
         D footprint = (p.x - p.x) + (p.y - p.y) + (p.slope - p.slope) + (p.v - p.v) + (p.c - p.c) + (p.a - p.a);
-        D loose = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
-        D broad = sqrt(p.a), tall = sqrt(p.c), narrow = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
-        D sr = unit * narrow / p.v, sy = unit * tall * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
+        D inputs_finite = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
+        D std_x = sqrt(p.a), std_y = sqrt(p.c), std_x_given_y = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
+        D sr = unit * std_x_given_y / p.v, sy = unit * std_y * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
         // Where q exceeds `level` nothing is drawn. The pixel decides; what follows from it only saves work, so it is
         // widened by more than any rounding of the exponent, which is as large as `faintest` there.
         D widened = min(fma(level, d8(1 + 1e-5), slack), d8(1e30));
-        D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
+        D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * std_x, high = reach * std_y;  // of the footprint
         // blocks with a pixel's centre in it
         const auto block = [](D pixel) { return floor(pixel * d8(1.0 / kBlock)); };
         D first_x = zero - floor(zero - clamp(p.x - wide - half, zero, w)), last_x = floor(clamp(p.x + wide - half, zero - one, w - one));
         D first_y = zero - floor(zero - clamp(p.y - high - half, zero, h)), last_y = floor(clamp(p.y + high - half, zero - one, h - one));
         D exact = (s.alpha_min > 0 ? root : d8(__builtin_inf())) * radius;
-        D radii[2] = {exact * broad, exact * tall};
+        D radii[2] = {exact * std_x, exact * std_y};
         D sides[4] = {block(first_x), block(last_x), block(first_y), block(last_y)};
         auto tiled = (first_x <= last_x) & (first_y <= last_y), inside = zero <= zero;
         if (s.compat) {
@@ -149,9 +149,9 @@ static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
 
         const auto is_zero = [&](D t) { return (zero <= t) & (t <= zero); };  // and a number
         D largest = max(max(p.scale[0], p.scale[1]), max(p.scale[2], abs(p.z)));
-        auto finite = is_zero(loose) & (largest <= d8(s.far)), turned = d8(1e-24) <= p.squared, ahead = d8(s.near) < p.z;
+        auto finite = is_zero(inputs_finite) & (largest <= d8(s.far)), has_direction = d8(1e-24) <= p.squared, in_front = d8(s.near) < p.z;
         auto seen = d8(s.alpha_min) < opacity, bounded = is_zero(footprint);
-        auto drawn = finite & turned & ahead & seen & bounded & inside;
+        auto drawn = finite & has_direction & in_front & seen & bounded & inside;
         D center[2] = {select(drawn, p.x, zero), select(drawn, p.y, zero)};
         radii[0] = select(drawn, radii[0], zero), radii[1] = select(drawn, radii[1], zero);
         store_columns<2>(args.means2d, group, end, center), store_columns<2>(args.radii, group, end, radii);
@@ -164,8 +164,8 @@ static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
         for (D& side : sides) side = select(on_tiles, side, zero);
         put_spans(args.spans, group, end, select(on_tiles, tiles, zero), sides);
         D status = d8(kOutside);  // the first reason of all counts
-        status = select(bounded, status, d8(kNonFinite)), status = select(seen, status, d8(kFaint)), status = select(ahead, status, d8(kBehind));
-        status = select(turned, status, d8(kZeroQuat)), status = select(finite, status, d8(kNonFinite)), status = select(drawn, d8(kDrawn), status);
+        status = select(bounded, status, d8(kNonFinite)), status = select(seen, status, d8(kFaint)), status = select(in_front, status, d8(kBehind));
+        status = select(has_direction, status, d8(kZeroQuat)), status = select(finite, status, d8(kNonFinite)), status = select(drawn, d8(kDrawn), status);
         put_bytes(args.status, group, end, status);
     }
 }
@@ -225,13 +225,13 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         columns_of<1>(in.opacities, group, in.count, &opacity);
         const D g_opacity = total[kE] / opacity;
 
-        const D bent = g_slope * p.inverse_c, two = d8(2);
+        const D g_slope_c = g_slope * p.inverse_c, two = d8(2);
         D gn1[3], gn2[3], g_rho[3], g_affine[6];
         for (int j = 0; j < 3; j++) {
             const D t = p.m1[j] - p.slope * p.m2[j];
-            const D g1 = two * g_v * t + bent * p.m2[j];
-            const D g2 = bent * (t - p.slope * p.m2[j]) - two * p.slope * g_v * t + two * g_c * p.m2[j];
-            g_rho[j] = two * (g_v * t * t + bent * t * p.m2[j] + g_c * p.m2[j] * p.m2[j]);
+            const D g1 = two * g_v * t + g_slope_c * p.m2[j];
+            const D g2 = g_slope_c * (t - p.slope * p.m2[j]) - two * p.slope * g_v * t + two * g_c * p.m2[j];
+            g_rho[j] = two * (g_v * t * t + g_slope_c * t * p.m2[j] + g_c * p.m2[j] * p.m2[j]);
             gn1[j] = g1 * p.scale[j], gn2[j] = g2 * p.scale[j];
         }
         D V[9];  // gradient of the rotation
@@ -243,11 +243,11 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         const D j00 = along(g_affine, 0), j02 = along(g_affine, 2), j11 = along(g_affine + 3, 1), j12 = along(g_affine + 3, 2);
 
         const D fx = d8(k.fx), fy = d8(k.fy), iz = p.inverse_z, zero = d8(0);
-        const D g_held_x = -(fx * iz * j02), g_held_y = -(fy * iz * j12);
-        D g_z = -(iz * iz * (fx * j00 + fy * j11 - fx * p.held_x * j02 - fy * p.held_y * j12));
+        const D g_clamped_x = -(fx * iz * j02), g_clamped_y = -(fy * iz * j12);
+        D g_z = -(iz * iz * (fx * j00 + fy * j11 - fx * p.clamped_x * j02 - fy * p.clamped_y * j12));
         // outside the limits the held ratio is a constant: no gradient through it
-        const D free_x = select(p.held_x <= p.ratio_x, select(p.ratio_x <= p.held_x, g_held_x, zero), zero);
-        const D free_y = select(p.held_y <= p.ratio_y, select(p.ratio_y <= p.held_y, g_held_y, zero), zero);
+        const D free_x = select(p.clamped_x <= p.ratio_x, select(p.ratio_x <= p.clamped_x, g_clamped_x, zero), zero);
+        const D free_y = select(p.clamped_y <= p.ratio_y, select(p.ratio_y <= p.clamped_y, g_clamped_y, zero), zero);
         const D to_x = free_x + fx * g_x, to_y = free_y + fy * g_y;
         const D camera[3] = {to_x * iz, to_y * iz, g_z - iz * (to_x * p.ratio_x + to_y * p.ratio_y) + total[kDepth]};
 

@@ -4,13 +4,13 @@
 
 namespace graings {
 
-struct Likeness {
+struct PhotometricTerms {
     double similarity, absolute, squared;  // means over pixels and channels
 };
 
 // Mean structural similarity, mean absolute and mean squared difference of two [height, width, 3] images. `gradient`,
 // which may be null, is that of their sum weighed by `weights`.
 template <class R>
-Likeness compare(int64_t height, int64_t width, const R* image, const R* target, Likeness weights, R* gradient, int threads);
+PhotometricTerms compare(int64_t height, int64_t width, const R* image, const R* target, PhotometricTerms weights, R* gradient, int threads);
 
 }  // namespace graings

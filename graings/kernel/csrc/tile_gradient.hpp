@@ -80,11 +80,11 @@ template <class R, bool Extra>
 GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     const TileArgs<R>& args = all.tiles;
     const int64_t begin = args.begin[tile], end = args.begin[tile + 1];
-    double* v_ground = all.v_background ? all.v_background + 3 * tile : nullptr;
-    if (v_ground) v_ground[0] = v_ground[1] = v_ground[2] = 0;
-    if (begin == end && !v_ground) return;
+    double* tile_v_background = all.v_background ? all.v_background + 3 * tile : nullptr;
+    if (tile_v_background) tile_v_background[0] = tile_v_background[1] = tile_v_background[2] = 0;
+    if (begin == end && !tile_v_background) return;
     const TileBox box = tile_box(args.camera, tile);
-    const Rule<R> limits = rule<R>(args.settings);
+    const Thresholds<R> limits = thresholds<R>(args.settings);
     const P<R> zero = p16(R(0));
 
     // upstream: colour, then alpha, then depth
@@ -96,15 +96,15 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         if (all.v_alpha) to_blocks<1>(all.v_alpha, box, args.camera.width, up + 3);
         if (all.v_depth) to_blocks<1>(all.v_depth, box, args.camera.width, up + 4);
     }
-    uint32_t heard = 0;  // blocks whose pixels have a say
+    uint32_t active = 0;  // blocks whose pixels have a say
     for (int b = 0; b < kBlocks; b++)
-        for (int c = 0; c < kChannels; c++) heard |= uint32_t(any_set(up[c][b])) << b;
+        for (int c = 0; c < kChannels; c++) active |= uint32_t(any_set(up[c][b])) << b;
 
     const auto sums_of = [&](uint32_t place) { return all.sums + size_t(rank(all.ranks, place)) * kSumStride; };
-    const auto put_nothing = [&](uint32_t place) { std::memset(sums_of(place), 0, kSums * sizeof(R)); };
+    const auto put_zeros = [&](uint32_t place) { std::memset(sums_of(place), 0, kSums * sizeof(R)); };
     const int n = args.kept[tile];
-    if (!heard) {
-        for (int64_t k = begin; k < begin + n; k++) put_nothing(args.pairs[k].place);
+    if (!active) {
+        for (int64_t k = begin; k < begin + n; k++) put_zeros(args.pairs[k].place);
         return;
     }
 
@@ -118,7 +118,7 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
         for (int c = 0; c < 3; c++) {
             const P<R> g = load<kLanes>(up[c][b]);
             ground = fma(g, p16(args.background[c]), ground);
-            if (v_ground) v_ground[c] += double(sum(g * load<kLanes>(light[b])));
+            if (tile_v_background) tile_v_background[c] += double(sum(g * load<kLanes>(light[b])));
         }
         store(behind[b], ground);
     }
@@ -127,38 +127,38 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     using Part = Vec<R, N>;
     const auto all_of = [](R x) { return splat<R, N>(x); };
     const Part none = all_of(R(0));
-    struct Seen {  // of a part of an entry's block
+    struct Evaluated {  // of a part of an entry's block
         Part raw;  // alpha before its cap
         Distance<R, N> at;
         int block, first;
     };
-    const auto look = [&](const TileEntry<R>& entry, uint32_t mask, int first) {
+    const auto evaluate = [&](const TileEntry<R>& entry, uint32_t mask, int first) {
         const int b = __builtin_ctz(mask);
         const Distance<R, N> at = distance<N>(entry, b, first);
-        return Seen{uncapped_alpha(entry, at), at, b, first};
+        return Evaluated{uncapped_alpha(entry, at), at, b, first};
     };
     struct Totals {
         Part e, er, es, err, ers, ess, red, green, blue, depth;
     };
-    const auto add = [&](Totals& total, const TileEntry<R>& entry, const Seen& seen) {
-        const auto of = [&](R (*lanes)[kLanes]) { return lanes[seen.block] + seen.first; };
-        const auto counts = (all_of(limits.alpha_min) <= seen.raw) & (all_of(entry.number) <= load<N>(last[seen.block] + seen.first));
-        const Part alpha = select(counts, min(seen.raw, all_of(limits.alpha_max)), none);
+    const auto add = [&](Totals& total, const TileEntry<R>& entry, const Evaluated& evaluated) {
+        const auto of = [&](R (*lanes)[kLanes]) { return lanes[evaluated.block] + evaluated.first; };
+        const auto counts = (all_of(limits.alpha_min) <= evaluated.raw) & (all_of(entry.number) <= load<N>(last[evaluated.block] + evaluated.first));
+        const Part alpha = select(counts, min(evaluated.raw, all_of(limits.alpha_max)), none);
         const Part before = load<N>(of(light)) / (all_of(R(1)) - alpha), weight = alpha * before;
         store(of(light), before);
         const Part g0 = load<N>(of(up[0])), g1 = load<N>(of(up[1])), g2 = load<N>(of(up[2]));
-        Part own = fma(g0, all_of(entry.look.red), fma(g1, all_of(entry.look.green), g2 * all_of(entry.look.blue)));
+        Part own = fma(g0, all_of(entry.params.red), fma(g1, all_of(entry.params.green), g2 * all_of(entry.params.blue)));
         if constexpr (Extra) {
             const Part g4 = load<N>(of(up[4]));
-            own = fma(g4, all_of(entry.look.depth), own + load<N>(of(up[3])));
+            own = fma(g4, all_of(entry.params.depth), own + load<N>(of(up[3])));
             total.depth = fma(weight, g4, total.depth);
         }
         const Part back = load<N>(of(behind)), gain = own - back;
         store(of(behind), fma(alpha, gain, back));
-        const Part ge = select(seen.raw <= all_of(limits.alpha_max), weight * gain, none);  // capped alpha passes none
-        const Part ge_r = ge * seen.at.r, ge_s = ge * seen.at.s;
+        const Part ge = select(evaluated.raw <= all_of(limits.alpha_max), weight * gain, none);  // capped alpha passes none
+        const Part ge_r = ge * evaluated.at.r, ge_s = ge * evaluated.at.s;
         total.e = total.e + ge, total.er = total.er + ge_r, total.es = total.es + ge_s;
-        total.err = fma(ge_r, seen.at.r, total.err), total.ers = fma(ge_r, seen.at.s, total.ers), total.ess = fma(ge_s, seen.at.s, total.ess);
+        total.err = fma(ge_r, evaluated.at.r, total.err), total.ers = fma(ge_r, evaluated.at.s, total.ers), total.ess = fma(ge_s, evaluated.at.s, total.ess);
         total.red = fma(weight, g0, total.red), total.green = fma(weight, g1, total.green), total.blue = fma(weight, g2, total.blue);
     };
 
@@ -174,7 +174,7 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     const auto record_of = [&](int j) -> const Record<R>& { return args.records[entries[j].id]; };
 
     const auto make_ready = [&](int j) {
-        if (entries[j].mask & heard) prepare(ready[readied++ % kReady], record_of(j), double(box.left), double(box.top), entries[j].key);
+        if (entries[j].mask & active) prepare(ready[readied++ % kReady], record_of(j), double(box.left), double(box.top), entries[j].key);
     };
     for (int j = n - 1; j >= 0 && j > n - 1 - kReadyAhead; j--) make_ready(j);
 
@@ -188,36 +188,36 @@ GRAINGS_INLINE void gradient(const TileGradientArgs<R>& all, int64_t tile) {
     constexpr bool kOverlap = kOne<R, kLanes>;
     Totals total;
     clear(total);
-    [[maybe_unused]] Seen seen;
+    [[maybe_unused]] Evaluated evaluated;
     const TileEntry<R>* latest = nullptr;  // that of the block looked at last
     int open = -1;                         // and its number
     const auto close = [&] {
-        add(total, *latest, seen);
+        add(total, *latest, evaluated);
         put(total, open);
     };
     for (int j = n - 1; j >= 0; j--) {
         if (j >= kRecordAhead) __builtin_prefetch(&record_of(j - kRecordAhead));
         if (j >= kReadyAhead) make_ready(j - kReadyAhead);
         if (!kStreamed<R> && j >= kSumsAhead) __builtin_prefetch(sums_of(entries[j - kSumsAhead].place), 1);
-        uint32_t mask = entries[j].mask & heard;
+        uint32_t mask = entries[j].mask & active;
         if (!mask) {
-            put_nothing(entries[j].place);
+            put_zeros(entries[j].place);
             continue;
         }
         const TileEntry<R>& entry = ready[taken++ % kReady];
         if constexpr (kOverlap) {
-            Seen next = look(entry, mask, 0);
+            Evaluated next = evaluate(entry, mask, 0);
             if (open >= 0) close();
-            open = j, latest = &entry, seen = next, clear(total);
+            open = j, latest = &entry, evaluated = next, clear(total);
             while (mask &= mask - 1) {
-                next = look(entry, mask, 0);
-                add(total, entry, seen);
-                seen = next;
+                next = evaluate(entry, mask, 0);
+                add(total, entry, evaluated);
+                evaluated = next;
             }
         } else {
             clear(total);
             for (; mask; mask &= mask - 1)
-                for (int first = 0; first < kLanes; first += N) add(total, entry, look(entry, mask, first));
+                for (int first = 0; first < kLanes; first += N) add(total, entry, evaluate(entry, mask, first));
             put(total, j);
         }
     }

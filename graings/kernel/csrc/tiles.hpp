@@ -22,13 +22,13 @@ alignas(64) constexpr R kRows[kLanes] = {-1.5, -1.5, -1.5, -1.5, -0.5, -0.5, -0.
 
 template <class R>
 GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top, int64_t number) {
-    const double sr = double(record.look.sr), sy = double(record.look.sy), dy = top + 2 - record.y, tilt = sr * record.slope;
+    const double sr = double(record.params.sr), sy = double(record.params.sy), dy = top + 2 - record.y, tilt = sr * record.slope;
     const auto all = [](double x) { return splat<double, kBlocks>(x); };
     const Vec<double, kBlocks> x = load<kBlocks>(kBlockX<double>), y = load<kBlocks>(kBlockY<double>);
     store(entry.r, rounded<R>(fma(all(sr), x, fma(all(-tilt), y, all(sr * ((left + 2 - record.x) - record.slope * dy))))));
     store(entry.s, rounded<R>(fma(all(sy), y, all(sy * dy))));
-    store(entry.lanes, fma(p16(record.look.sr), load<kLanes>(kColumns<R>), p16(R(-tilt)) * load<kLanes>(kRows<R>)));
-    entry.look = record.look, entry.lean = R(tilt), entry.number = R(number);
+    store(entry.lanes, fma(p16(record.params.sr), load<kLanes>(kColumns<R>), p16(R(-tilt)) * load<kLanes>(kRows<R>)));
+    entry.params = record.params, entry.tilt = R(tilt), entry.number = R(number);
 }
 
 // Blocks that a prepared entry may reach, one bit each. Over a block's pixel centres r changes by 1.5 (sr + |tilt|) at
@@ -38,10 +38,10 @@ GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double
 template <class R>
 GRAINGS_INLINE uint32_t reached_blocks(const TileEntry<R>& entry) {
     constexpr R margin = R(1.5) + (sizeof(R) == 4 ? R(6e-5) : R(1e-13));
-    const P<R> wide = p16(entry.look.sr), rise = p16(entry.look.sy), lean = abs(p16(entry.lean)), zero = p16(R(0));
-    const P<R> r = max(abs(load<kLanes>(entry.r)) - p16(margin) * (wide + lean), zero);
+    const P<R> wide = p16(entry.params.sr), rise = p16(entry.params.sy), tilt = abs(p16(entry.tilt)), zero = p16(R(0));
+    const P<R> r = max(abs(load<kLanes>(entry.r)) - p16(margin) * (wide + tilt), zero);
     const P<R> s = max(abs(load<kLanes>(entry.s)) - p16(margin) * rise, zero);
-    return bits(fma(r, r, s * s) <= p16(entry.look.level));
+    return bits(fma(r, r, s * s) <= p16(entry.params.level));
 }
 
 // entries[b]: which of the masks have bit b.
@@ -106,19 +106,19 @@ template <class R, int N = kLanes> struct Distance { Vec<R, N> r, s; };
 template <int N = kLanes, class R>
 GRAINGS_INLINE Distance<R, N> distance(const TileEntry<R>& entry, int block, int first = 0) {
     const auto all = [](R x) { return splat<R, N>(x); };
-    return {load<N>(entry.lanes + first) + all(entry.r[block]), fma(all(entry.look.sy), load<N>(kRows<R> + first), all(entry.s[block]))};
+    return {load<N>(entry.lanes + first) + all(entry.r[block]), fma(all(entry.params.sy), load<N>(kRows<R> + first), all(entry.s[block]))};
 }
 
 template <class R, int N>
 GRAINGS_INLINE Vec<R, N> uncapped_alpha(const TileEntry<R>& entry, const Distance<R, N>& d) {
-    return exp2(fnma(d.r, d.r, fnma(d.s, d.s, splat<R, N>(entry.look.log_opacity))));
+    return exp2(fnma(d.r, d.r, fnma(d.s, d.s, splat<R, N>(entry.params.log_opacity))));
 }
 
 // What decides whether an entry counts in a pixel. Light so faint that no sum in R can see it counts as none: so much
 // remains that the gradient can go back through it.
-template <class R> struct Rule { R alpha_min, alpha_max, transmittance_min; };
+template <class R> struct Thresholds { R alpha_min, alpha_max, transmittance_min; };
 template <class R>
-GRAINGS_INLINE Rule<R> rule(const Settings& s) {
+GRAINGS_INLINE Thresholds<R> thresholds(const Settings& s) {
     constexpr double faintest = sizeof(R) == 4 ? 1e-30 : 1e-290;
     return {R(s.alpha_min), R(s.alpha_max), R(s.transmittance_min < faintest ? faintest : s.transmittance_min)};
 }
@@ -157,9 +157,9 @@ template <class R> struct Step {
 };
 
 template <class R, bool Compat>
-GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& open) {
-    const P<R> zero = p16(R(0)), stop = p16(rule.transmittance_min), capped = min(raw, p16(rule.alpha_max));
-    const auto drawn = p16(rule.alpha_min) <= raw;
+GRAINGS_INLINE Step<R> blend(P<R> raw, const Thresholds<R>& thresholds, P<R>& light, P<R>& open) {
+    const P<R> zero = p16(R(0)), stop = p16(thresholds.transmittance_min), capped = min(raw, p16(thresholds.alpha_max));
+    const auto drawn = p16(thresholds.alpha_min) <= raw;
     if constexpr (Compat) {
         const P<R> alpha = select(drawn & (zero < open), capped, zero), next = light * (p16(R(1)) - alpha);
         open = select(next < stop, zero, open);
@@ -201,7 +201,7 @@ constexpr int kSmall = 3;  // entries that touch fewer blocks, on average, are s
 template <class R, bool Compat, bool Keep, bool Depth>
 GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end, TileEntry<R>* chunk) {
     const TileBox box = tile_box(args.camera, tile);
-    const Rule<R> limits = rule<R>(args.settings);
+    const Thresholds<R> limits = thresholds<R>(args.settings);
     alignas(64) R open[kBlocks][kLanes], light[kBlocks][kLanes], last[kBlocks][kLanes], channels[4][kBlocks][kLanes];
     uint32_t live = open_lanes(box, open);
     std::memcpy(light, open, sizeof light);
@@ -256,10 +256,10 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
                 raw = next;
                 if constexpr (Keep) latest = select(counts, p16(entry.number), latest);
                 if constexpr (watch) unseen |= uint64_t(!any(seen)) << j;
-                red = fma(weight, p16(entry.look.red), red);
-                green = fma(weight, p16(entry.look.green), green);
-                blue = fma(weight, p16(entry.look.blue), blue);
-                if constexpr (Depth) depth = fma(weight, p16(entry.look.depth), depth);
+                red = fma(weight, p16(entry.params.red), red);
+                green = fma(weight, p16(entry.params.green), green);
+                blue = fma(weight, p16(entry.params.blue), blue);
+                if constexpr (Depth) depth = fma(weight, p16(entry.params.depth), depth);
             }
             store(light[b], t), store(open[b], going);
             if constexpr (Keep) store(last[b], latest);

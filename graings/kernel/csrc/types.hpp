@@ -12,7 +12,7 @@ constexpr int kBlocks = 16;  // per tile, row by row
 constexpr int kLanes = 16;   // pixels per block, row by row
 constexpr int kSums = 10;    // partial sums per (tile, Gaussian)
 constexpr int kSumStride = 16;  // numbers from one pair's sums to the next: a cache line in single precision
-constexpr int64_t kLongestSide = int64_t(kBlock) << 16;  // of an image: blocks are counted in 16 bits
+constexpr int64_t kMaxImageSide = int64_t(kBlock) << 16;  // of an image: blocks are counted in 16 bits
 
 struct Camera {
     double rotation[9];  // world to camera, row by row
@@ -32,13 +32,13 @@ enum Status : uint8_t { kDrawn, kNonFinite, kZeroQuat, kBehind, kFaint, kOutside
 // alpha = 2^(log_opacity - q) with q = (sr (dx - slope dy))^2 + (sy dy)^2; nothing is drawn where q exceeds `level`.
 // Logarithms are of base 2.
 template <class R>
-struct Look {
+struct SplatParameters {
     R sr, sy, log_opacity, red, green, blue, depth, level;
 };
 template <class R>
 struct alignas(64) Record {
     double x, y, slope;
-    Look<R> look;
+    SplatParameters<R> params;
 };
 static_assert(sizeof(Record<float>) == 64);
 
@@ -74,8 +74,8 @@ struct Ranks {
 template <class R>
 struct alignas(64) TileEntry {
     R lanes[kLanes], r[kBlocks], s[kBlocks];
-    Look<R> look;
-    R lean;    // sr slope
+    SplatParameters<R> params;
+    R tilt;    // sr slope
     R number;  // of the entry in its tile
 };
 
@@ -137,6 +137,14 @@ struct GeometryGradientArgs {
     R *v_means, *v_quats, *v_log_scales, *v_opacities, *v_colors, *v_offset;  // v_offset may be null
 };
 
+// SSIM as 3D Gaussian Splatting defines it; graings/constants.py holds the same numbers, and a test compares the two.
+// Compiled in, because the loops over the window are unrolled.
+constexpr int kSsimRadius = 5;  // of the window, in pixels
+constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
+// exp(-k^2 / (2 sigma^2)) for k = 0..5 with sigma 1.5, normalised over the 11 taps.
+constexpr double kSsimTaps[kSsimRadius + 1] = {0.2660117248617943,   0.21300553771125366,  0.1093606895097,
+                                               0.03600077212843082, 0.007598758135239184, 0.0010283800844791099};
+
 struct Range { int64_t begin, end; };  // [begin, end)
 
 template <class R>
@@ -145,7 +153,7 @@ struct SsimArgs {
     int64_t row;    // numbers from one row of image, target and gradient to the next
     const R *image, *target;
     const Range* windows;  // of each row, the numbers whose window sees a difference: elsewhere similarity is 1
-    const Range* pulled;   // and those that such a window pulls at: elsewhere the gradient is 0, and is not written
+    const Range* affected;   // and those that such a window pulls at: elsewhere the gradient is 0, and is not written
     R* gradient;    // [height, width, 3] or null
     R* maps;        // three planes [height, width, 3]: what the gradient filters back
     double* sums;   // per band: of the similarity, of |image - target| and of its square
