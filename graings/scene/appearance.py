@@ -118,7 +118,10 @@ class ResidualField(TemporalHead):
         self.seeing = TemporalHead(config, config.feature_dim + seen, 3 * config.children) if seen else None
 
     def forward(
-        self, features: Float[Tensor, "anchor feature"], time: Float[Tensor, 1], directions: Float[Tensor, "anchor 3"]
+        self,
+        features: Float[Tensor, "anchor feature"],
+        time: Float[Tensor, " 1"],
+        directions: Float[Tensor, "anchor 3"],
     ) -> Float[Tensor, "anchor child 4"]:
         """(Delta c, Delta o) of every slot at `time` in [0, 1], unbounded."""
         moment = frequency_encoding(time, self.time_frequencies)
