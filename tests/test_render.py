@@ -13,7 +13,7 @@ from graings.camera.camera import Camera
 from graings.camera.sampling_rate import SamplingRate
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
-from graings.render import MOST_PIXELS, draw, low_pass, picture, render, supersampling
+from graings.render import MAX_SUPERSAMPLED_PIXELS, draw, low_pass, render, render_composition, supersampling
 from graings.scene.scene import Scene
 from tests.capture.captures import orbit
 from tests.models import tiny_scene
@@ -42,7 +42,7 @@ def test_a_picture_has_the_low_pass_of_its_scene_in_its_own_pixels(
         expected = rasterize(composition.gaussians, camera, torch.tensor(WHITE), settings=asked).color
         assert torch.equal(draw(composition, camera, WHITE, settings=settings).color, expected)
         if share >= 1:  # smaller ones are drawn finer
-            assert torch.equal(picture(composition, camera, WHITE, settings=settings).color, expected)
+            assert torch.equal(render_composition(composition, camera, WHITE, settings=settings).color, expected)
             assert torch.equal(render(scene, camera, 0.5, WHITE, settings=settings).color, expected)
         other = draw(replace(composition, blur=2.0), camera, WHITE, settings=settings).color
         assert not torch.equal(other, expected)
@@ -146,7 +146,7 @@ def test_as_many_parts_as_training_had_pixels_and_no_more_than_memory_bears() ->
     assert [parts(share) for share in (4, 1, 0.96, 0.94, 0.5, 0.49, 0.26, 0.1)] == [1, 1, 1, 2, 2, 2, 4, 10]
     assert parts(0.01, 4096, 4096) == 1
     assert parts(0.01, 1920, 1080) == 2
-    assert parts(1e-200) == math.isqrt(MOST_PIXELS // 64**2)
+    assert parts(1e-200) == math.isqrt(MAX_SUPERSAMPLED_PIXELS // 64**2)
 
 
 @pytest.mark.parametrize("focal", [1e-300, 1e-200, 1e200, 1e300])

@@ -20,7 +20,7 @@ from torch.nn import functional
 from graings import kernel
 from graings.camera.camera import View
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
-from graings.render import draw, picture
+from graings.render import draw, render_composition
 from graings.report.machine import machine_facts, version_facts
 from graings.report.work_precision import pareto
 from graings.scene.scene import Composition
@@ -135,7 +135,7 @@ class _Frame:
         camera = self.view.camera
         if way.scale != 1.0:
             camera = camera.resized(max(1, round(camera.width * way.scale)), max(1, round(camera.height * way.scale)))
-        return picture(self.composition, camera, model.background, settings=way.raster).color
+        return render_composition(self.composition, camera, model.background, settings=way.raster).color
 
 
 def _views(model: Model, count: int, seconds: float) -> tuple[str, tuple[View, ...]]:
