@@ -9,14 +9,14 @@
 namespace graings {
 namespace {
 
-constexpr int64_t kPiece = 2048;  // children handed to a thread at a time
+constexpr int64_t kPiece = 2048;  // children per piece of work
 
 template <class Body>
 void in_pieces(int threads, int64_t count, Body body) {
     parallel_for(threads, (count + kPiece - 1) / kPiece, [&](int, int64_t piece) { body(piece * kPiece, std::min(count, (piece + 1) * kPiece)); });
 }
 
-// Runs of anchors with about as many children each: body(first anchor, last, first child, last).
+// Calls body(first anchor, last, first child, last) for ranges of anchors and their drawn children.
 template <class Body>
 void in_runs(int threads, int64_t anchors, int64_t slots, int64_t drawn, const int64_t* children, Body body) {
     constexpr int64_t kRun = 512;
@@ -37,7 +37,7 @@ Quat<R> product(const Quat<R>& a, const Quat<R>& b) {
 }
 template <class R> Quat<R> conjugate(const Quat<R>& q) { return {q.w, -q.x, -q.y, -q.z}; }
 
-// Below this norm there is no direction (as torch's normalize, whose divisor stops there).
+// Smallest divisor of the normalisation, as in torch's normalize.
 constexpr double kLeastNorm = 1e-12;
 
 template <class R>
@@ -49,10 +49,10 @@ Quat<R> canonical(const R* raw, R& norm) {
 
 template <class R> Quat<R> deformed_rotation(const R* deformation) { return {deformation[3] + R(1), deformation[4], deformation[5], deformation[6]}; }
 
-// A NaN passes through: it must reach whoever looks for one.
+// A NaN passes, so that later checks find it.
 template <class R> R clip(R x, R low, R high) { return x < low ? low : x > high ? high : x; }
 
-// The gradient that passes a clip at x.
+// The gradient through a clip of x.
 template <class R>
 R clip_gradient(R v, R x, R low, R high, bool projected) {
     if (x > high) return projected && v > R(0) ? v : R(0);
@@ -133,7 +133,7 @@ void compose_gradient(const NetworkOutputs<R>& in, const R* v_mean, const R* v_q
             const Quat<R> q = canonical(in.canonical + 7 * i, norm);
             Quat<R> v{v_quat[4 * i], v_quat[4 * i + 1], v_quat[4 * i + 2], v_quat[4 * i + 3]};
             if (deformation) {
-                // quaternions multiply without changing angles: the adjoint of a factor is its conjugate
+                // the adjoint of multiplication by a quaternion is multiplication by its conjugate
                 const Quat<R> t = product(conjugate(q), v);
                 v_deformation[10 * i + 3] = t.w, v_deformation[10 * i + 4] = t.x, v_deformation[10 * i + 5] = t.y, v_deformation[10 * i + 6] = t.z;
                 v = product(v, conjugate(deformed_rotation(deformation)));

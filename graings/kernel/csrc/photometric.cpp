@@ -13,7 +13,7 @@ namespace {
 
 constexpr int64_t kReach = kSsimRadius;
 
-// Of each row of two images the pixels from the first that differs to the last; none: [width, 0). NaN differs from all.
+// For each row, the range from the first to the last differing pixel; [width, 0) if none. NaN differs from everything.
 template <class R>
 std::vector<Range> differing(int64_t height, int64_t width, const R* image, const R* target) {
     std::vector<Range> parts(size_t(height), Range{width, 0});
@@ -28,7 +28,7 @@ std::vector<Range> differing(int64_t height, int64_t width, const R* image, cons
     return parts;
 }
 
-// Of each row what lies within the window's reach of the parts.
+// For each row, the range of pixels within the window's radius of the ranges `parts`.
 std::vector<Range> widened(const std::vector<Range>& parts, int64_t width) {
     const int64_t height = int64_t(parts.size());
     std::vector<Range> wide(parts.size(), Range{width, 0});
@@ -47,7 +47,7 @@ template <class R>
 PhotometricTerms compare(int64_t height, int64_t width, const R* image, const R* target, PhotometricTerms weights, R* gradient, int threads) {
     constexpr int64_t kBand = 16;  // rows
     const Kernels<R>& run = kernels<R>();
-    // No window beyond `windows` sees a difference, and none that does pulls at anything beyond `pulled`.
+    // Windows centred outside `windows` contain no difference; pixels outside `affected` are in no window that does.
     std::vector<Range> windows = widened(differing(height, width, image, target), width), affected = widened(windows, width);
     Range across{width, 0}, down{height, 0};
     for (int64_t y = 0; y < height; y++) {
@@ -58,7 +58,7 @@ PhotometricTerms compare(int64_t height, int64_t width, const R* image, const R*
     }
     if (down.begin >= down.end) across = down = {0, 0};
     const int64_t rows = down.end - down.begin, columns = across.end - across.begin, first = 3 * (down.begin * width + across.begin);
-    const auto numbers = [&](std::vector<Range>& parts) {  // from pixels of the image to numbers of its part
+    const auto numbers = [&](std::vector<Range>& parts) {  // from pixels of the image to numbers of the bounding box
         int64_t count = 0;
         for (Range& part : parts) {
             part = part.begin < part.end ? Range{3 * (part.begin - across.begin), 3 * (part.end - across.begin)} : Range{0, 0};

@@ -17,9 +17,9 @@
 namespace graings {
 namespace {
 
-// Loops follow each other closely within a step, and waking a sleeping thread takes longer than many of them: who
-// waits looks about for this long before it sleeps, first for itself, then offering its core to others in between. Who
-// gets it back late has a neighbour there and sleeps at once.
+// Loops follow each other closely within a step, and waking a sleeping thread takes longer than many of them. A waiting
+// thread therefore spins for kSpinTime before it sleeps, after kYieldAfter with yields in between. A yield that takes
+// longer than kLateYield means that another thread uses the core; then it sleeps at once.
 constexpr std::chrono::microseconds kSpinTime{1500}, kYieldAfter{60}, kLateYield{30};
 
 void relax() {
@@ -46,15 +46,15 @@ bool spin_until(Done done) {
     return done();
 }
 
-// A thread that sleeps, and the CPU it last ran on.
+// A thread of the pool, and the CPU it last ran on.
 struct Worker {
     std::thread thread;
     std::atomic<int> cpu{-1};
 
 #ifdef __linux__
     void record_cpu() { cpu.store(sched_getcpu(), std::memory_order_relaxed); }
-    // Linux likes to wake a thread where it slept, even if that CPU is busy with the one who wakes it and others are
-    // idle; the two then take turns for milliseconds.
+    // Linux tends to wake a thread on the CPU where it slept, even if the waking thread runs there and other CPUs are idle;
+    // the two then share it for milliseconds.
     void avoid_cpu(int busy, const cpu_set_t& usable) {
         if (cpu.load(std::memory_order_relaxed) != busy) return;
         cpu_set_t others = usable;

@@ -1,6 +1,6 @@
-// Vectors of N numbers built from the registers of the instruction set this file is compiled for.
-// Everything lives in the namespace of that instruction set and is inlined, so that no symbol compiled for
-// a newer CPU can be picked by the linker for an older one. Products and sums are fused only where `fma` says so.
+// Vectors of N numbers, built from the registers of the instruction set that this file is compiled for.
+// Everything is in the namespace of that instruction set and inlined, so that the linker cannot use a symbol compiled
+// for a newer CPU on an older one. Products and sums are fused only by explicit `fma`.
 #pragma once
 #include <cstdint>
 #include <cstring>
@@ -94,7 +94,7 @@ template <class M> GRAINGS_INLINE bool any_lane(M m) {
     return any;
 }
 #if defined(__AVX2__)
-// In one instruction, which the compiler does not always find: a < b ? a : b and a > b ? a : b.
+// a < b ? a : b and a > b ? a : b in one instruction, which the compiler does not always emit.
 GRAINGS_INLINE Native<float> minimum(Native<float> a, Native<float> b) { return (Native<float>)_mm256_min_ps((__m256)a, (__m256)b); }
 GRAINGS_INLINE Native<double> minimum(Native<double> a, Native<double> b) { return (Native<double>)_mm256_min_pd((__m256d)a, (__m256d)b); }
 GRAINGS_INLINE Native<float> maximum(Native<float> a, Native<float> b) { return (Native<float>)_mm256_max_ps((__m256)a, (__m256)b); }
@@ -285,12 +285,12 @@ template <int N> GRAINGS_INLINE Vec<double, N> power_of_two_part(Vec<double, N> 
                             0.6931471805599453, 1.0};
     return polynomial(f, c);
 }
-// 2^x for x up to about 1; far below any contribution (2^-125, 2^-1021) it need not be exact.
+// 2^x for x up to about 1; inexact below 2^-125 (2^-1021 in double), far below any visible contribution.
 GRAINGS_VEC Vec<T, N> exp2(Vec<T, N> x) {
 #if defined(__AVX512F__)
     if constexpr (sizeof(T) == 4 && kOne<T, N>) {
-        // The fraction above the whole number below; scalef takes that number itself. Minimax on [0, 1) with the
-        // constant term fixed at 1: 8.3e-8 before rounding, 1.5e-7 after.
+        // The fraction x - floor(x); scalef uses floor(x) itself. Minimax on [0, 1) with the constant term fixed at 1:
+        // 8.3e-8 before rounding, 1.5e-7 after.
         const Vec<T, N> f{(Native<T>)_mm512_reduce_ps((__m512)x.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)};
         constexpr float c[] = {1.86713007e-3f, 9.01703032e-3f, 5.57999131e-2f, 2.4016445e-1f, 6.93151312e-1f, 1.0f};
         return {(Native<T>)_mm512_scalef_ps((__m512)polynomial(f, c).v, (__m512)x.v)};
@@ -303,7 +303,7 @@ GRAINGS_VEC Vec<T, N> exp2(Vec<T, N> x) {
     auto f = x - (shifted - splat<T, N>(magic));
     return scale_by_power(power_of_two_part(f), shifted);
 }
-// The whole number below, for |x| < 2^51
+// floor(x) for |x| < 2^51
 GRAINGS_VEC Vec<T, N> floor(Vec<T, N> x) {
     static_assert(sizeof(T) == 8);
     if constexpr (kOne<T, N>) {
@@ -318,7 +318,7 @@ GRAINGS_VEC Vec<T, N> floor(Vec<T, N> x) {
 #endif
     } else return {floor(x.lo), floor(x.hi)};
 }
-// e^x, with x limited to [-708, 709]; for R = float to 6e-11, more than it can tell
+// e^x, with x limited to [-708, 709]; for R = float to 6e-11, below its precision
 template <class R, int N> GRAINGS_INLINE Vec<double, N> exp(Vec<double, N> x) {
     constexpr double magic = 6755399441055744;
     x = clamp(x, splat<double, N>(-708), splat<double, N>(709));
@@ -341,7 +341,7 @@ template <int N> GRAINGS_INLINE void split_power(Vec<double, N> x, Vec<double, N
     if constexpr (kOne<double, N>) {
         typedef NativeBits<double> I;
         const I bits = (I)x.v, above = (bits & 0xFFFFFFFFFFFFF) > 0x6A09E667F3BCC ? I{} + 1 : I{};  // of the fraction in [1, 2)
-        constexpr double magic = 6755399441055744;  // 1.5 * 2^52, whose lowest bits count: few CPUs convert whole numbers of 64 bits
+        constexpr double magic = 6755399441055744;  // 1.5 * 2^52: conversion by addition, because few CPUs convert 64-bit integers
         power.v = (Native<double>)((bits >> 52) - 1023 + above + (I)(Native<double>{} + magic)) - magic;
         fraction.v = (Native<double>)((bits & 0xFFFFFFFFFFFFF) | ((I{} + 1023 - above) << 52));
     } else {

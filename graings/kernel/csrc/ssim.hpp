@@ -11,12 +11,12 @@ namespace graings::GRAINGS_ISA {
 
 constexpr int kPad = 3 * kSsimRadius;  // a neighbouring pixel is three numbers away
 
-// As many numbers as a register holds: what is summed over a window stays in registers on every instruction set.
+// One register of numbers at a time, so that the sums over a window stay in registers on every instruction set.
 template <class R> constexpr int kRegisterWidth = kNative<R>;
 template <class R> using Register = Vec<R, kRegisterWidth<R>>;
 template <class R> GRAINGS_INLINE Register<R> broadcast(R x) { return splat<R, kRegisterWidth<R>>(x); }
 
-// The numbers of a row from `x` on, of which `left` remain: all of a register, or zeros behind.
+// Loads a register of which `left` numbers are inside the row; if not Whole, zeros follow.
 template <bool Whole, class R>
 GRAINGS_INLINE Register<R> take(const R* p, int64_t left) {
     if constexpr (Whole) return load<kRegisterWidth<R>>(p);
@@ -31,20 +31,20 @@ GRAINGS_INLINE void put(R* p, int64_t left, Register<R> value) {
     store(lanes, value);
     std::memcpy(p, lanes, sizeof(R) * size_t(left));
 }
-// Calls each(x, numbers left, whole) for a part of a row, a register at a time.
+// Calls each(x, numbers left, whole register) for a range of a row, a register at a time.
 template <class R, class Each>
 GRAINGS_INLINE void each_register(Range part, Each each) {
     int64_t x = part.begin;
     for (; x + kRegisterWidth<R> <= part.end; x += kRegisterWidth<R>) each(x, part.end - x, std::true_type());
     if (x < part.end) each(x, part.end - x, std::false_type());
 }
-// What the window reaches from there, in a row of so many numbers.
+// The range widened by the window's radius, within a row of `length` numbers.
 GRAINGS_INLINE Range widened(Range part, int64_t length) {
     if (part.begin >= part.end) return part;
     return {part.begin < kPad ? 0 : part.begin - kPad, part.end + kPad > length ? length : part.end + kPad};
 }
 
-// Row length of the scratch: zeros left and right so that the horizontal pass needs no bounds.
+// Row length of the scratch memory, with zeros on both sides so that the horizontal filter needs no bounds checks.
 GRAINGS_INLINE int64_t padded(int64_t width) { return 3 * width + 2 * kPad + 2 * kLanes; }
 
 template <class R>
@@ -54,7 +54,7 @@ GRAINGS_INLINE Register<R> filter_row(const R* row) {
     return sum;
 }
 
-// Values of rows [begin, end): their sums go to sums[3 * band]; with a gradient wanted, its three maps are kept.
+// The measures of rows [begin, end), summed into sums[3 * band]; if `maps` is given, writes the maps for the gradient.
 template <class R>
 static void ssim_values(const SsimArgs<R>& args, int64_t band, int64_t begin, int64_t end, R* scratch) {
     using V = Register<R>;
@@ -110,7 +110,7 @@ static void ssim_values(const SsimArgs<R>& args, int64_t band, int64_t begin, in
     args.sums[3 * band] = sum(total), args.sums[3 * band + 1] = sum(absolute), args.sums[3 * band + 2] = sum(squared);
 }
 
-// Filters the maps back: the window is symmetric, so the adjoint of the filter is the filter.
+// The adjoint: the window is symmetric, so the adjoint of the filter is the filter.
 template <class R>
 static void ssim_gradient(const SsimArgs<R>& args, int64_t begin, int64_t end, R* scratch) {
     using V = Register<R>;
