@@ -1,4 +1,4 @@
-"""What image error buys what time: cut-offs, resolution, precision, threads and instruction sets of the rasterizer.
+"""Image error against time: cut-offs, resolution, precision, threads and instruction sets of the rasterizer.
 
     python benchmarks/raster_precision.py --yardstick DIR -o FOLDER [--gaussians 50000] [--size 400] [--rounds 9]
 
@@ -42,7 +42,7 @@ EXACTLY = 1e-17
 
 @dataclass(frozen=True)
 class Point:
-    """One way to draw the picture: what it costs and how wrong it is."""
+    """Time and error of one way to draw the image."""
 
     group: str
     label: str
@@ -73,7 +73,7 @@ def scaled(camera: Camera, factor: float) -> Camera:
 
 
 class Bench:
-    """One scene and camera, with the picture everything is compared with."""
+    """One scene and camera, with the reference image."""
 
     def __init__(self, generator: Any, count: int, size: int, rounds: int) -> None:
         raw, view = generator.make_scene(count), generator.camera(size)
@@ -91,7 +91,7 @@ class Bench:
         self, group: str, label: str, *, settings: RasterSettings = DEFAULT, dtype: torch.dtype = torch.float32,
         factor: float = 1.0, threads: int | None = None,
     ) -> Point:  # fmt: skip
-        """Time and error of one setting; pictures of another resolution are scaled back bilinearly."""
+        """Time and error of one setting; images of another resolution are scaled to full size bilinearly."""
         use_threads(threads)
         gaussians, camera = cast(self.gaussians, dtype), scaled(self.camera, factor)
         background = torch.zeros(3, dtype=dtype)
@@ -117,7 +117,7 @@ class Bench:
 
 
 def floor(generator: Any) -> float:
-    """Largest difference of the reference to the torch oracle, on a small scene."""
+    """Largest difference between the reference and the torch oracle, on a small scene."""
     small = Bench(generator, 300, 64, 1)
     double = cast(small.gaussians, torch.float64)
     oracle = reference.rasterize(double, small.camera, torch.zeros(3, dtype=torch.float64), settings=EXACT).color
@@ -125,7 +125,7 @@ def floor(generator: Any) -> float:
 
 
 def pareto(points: list[Point]) -> list[Point]:
-    """Those that no other beats in both time and error, by time."""
+    """The points that no other one beats in both time and error, sorted by time."""
     front: list[Point] = []
     for point in sorted(points, key=lambda p: (p.ms, p.rmse)):
         if not front or point.rmse < front[-1].rmse:
@@ -134,7 +134,7 @@ def pareto(points: list[Point]) -> list[Point]:
 
 
 def shown(rmse: float) -> float:
-    """Where an error is drawn: a logarithmic axis has no place for the reference itself."""
+    """The error as plotted: a logarithmic axis cannot show the reference's error of 0."""
     return max(rmse, EXACTLY)
 
 
@@ -162,7 +162,7 @@ def draw(axis: Any, points: list[Point], title: str, xlabel: str, scale: float) 
 
 
 def label(axis: Any, points: list[Point], scale: float) -> None:
-    """Names the points once the axes have their size: those that lie on each other share a label, none covers one."""
+    """Labels the points after layout: coinciding points share a label, and labels do not overlap."""
     places = axis.transData.transform([(p.ms * scale, shown(p.rmse)) for p in points])
     clusters: list[tuple[Any, list[str]]] = []
     for place, point in zip(places, points, strict=True):

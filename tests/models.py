@@ -1,4 +1,4 @@
-"""Tiny scenes for tests: a few anchors with random values, every module awake."""
+"""Tiny scenes for tests: a few anchors with random values, and random weights in every network."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from graings.scene.scene import Scene
 EYE = (0.0, -2.0, 0.5)
 
 
-SAMPLING = SamplingRate(extent=1.0, reference=10.0, coarsest=10.0)  # of small test cameras, about
+SAMPLING = SamplingRate(extent=1.0, reference=10.0, coarsest=10.0)  # about that of small test cameras
 
 
 def tiny_scene(
-    *, anchors: int = 20, seed: int = 0, temporal: bool = True, awake: bool = True, **config: object
+    *, anchors: int = 20, seed: int = 0, temporal: bool = True, randomize: bool = True, **config: object
 ) -> Scene:
-    """A scene of `anchors` anchors in the unit ball; `awake` gives the zero-born layers random weights."""
+    """A scene of `anchors` anchors in the unit ball; `randomize` gives zero-initialised layers random weights."""
     settings = SceneConfig.model_validate(
         {"children": 3, "feature_dim": 8, "head_width": 8, "static_width": 8, "deform_width": 16, "deform_depth": 2}
         | config
@@ -31,7 +31,7 @@ def tiny_scene(
         offsets=torch.randn(anchors, settings.children, 3) * 0.3,
     )
     scene = Scene(settings, scaffold, extent=1.0, sampling=SAMPLING, initial_opacity=0.3)
-    if awake:
+    if randomize:
         with torch.no_grad():
             seeing = None if scene.residual is None else scene.residual.seeing
             for module in (scene.deformation, scene.residual, seeing):

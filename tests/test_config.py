@@ -52,7 +52,14 @@ def test_every_option_is_less_deep_than_the_limit() -> None:
     assert depth(make_config().model_dump()) < MAX_DEPTH
 
 
-@pytest.mark.parametrize("overrides", [{"iterations": {}}, {"iterations.a": 1}])
-def test_a_single_value_is_not_a_section(overrides: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match="iterations: is a single value, not a section"):
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"iterations": {}}, "iterations: Input should be a valid integer"),
+        ({"iterations.a": 1}, "iterations: Input should be a valid integer"),
+        ({"iterations": 5, "iterations.a": 1}, "iterations: is a single value, not a section"),
+    ],
+)
+def test_a_single_value_is_not_a_section(overrides: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         make_config("draft", overrides)

@@ -1,4 +1,4 @@
-"""Fused SSIM and L1: equal to plain torch, the same bits on any number of threads, bounded where clamped."""
+"""The fused photometric loss: equal to plain torch, the same bits for any number of threads, in range where clamped."""
 
 from __future__ import annotations
 
@@ -64,12 +64,10 @@ def test_single_precision_stays_close_to_double(size: tuple[int, int], isa: str)
 @pytest.mark.parametrize("squared", [0.0, 7.0])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("size", SIZES)
-def test_the_mixture_with_differences_equals_torch(
-    size: tuple[int, int], weight: float, squared: float, isa: str
-) -> None:
+def test_the_weighted_loss_equals_the_reference(size: tuple[int, int], weight: float, squared: float, isa: str) -> None:
     image, target = pair(*size)
     if image.numel() > 3:
-        image[0, 0] = target[0, 0]  # no difference, no direction
+        image[0, 0] = target[0, 0]  # the gradient of |x| at 0 is 0
 
     def ours(x: Tensor, y: Tensor) -> Tensor:
         return photometric(x, y, weight, squared)
@@ -124,12 +122,12 @@ def box(rows: slice, columns: slice) -> Callable[[Tensor, Tensor], Tensor]:
         box(slice(0, 60), slice(49, 50)),
         box(slice(8, 9), slice(30, 31)),
         box(slice(30, 30), slice(0, 0)),
-        pytest.param(lambda y, x: (x - 45 + y).abs() < 2, id="a slanted stripe, whose part of a row moves on"),
-        pytest.param(lambda y, x: (y - 12) * (y - 47) + x * (x - 49) == 0, id="four corners, far apart in rows"),
-        pytest.param(lambda y, x: (y % 23 == 4) & (x == 3 * (y // 23)), id="rows that see nothing between others"),
+        pytest.param(lambda y, x: (x - 45 + y).abs() < 2, id="a slanted stripe"),
+        pytest.param(lambda y, x: (y - 12) * (y - 47) + x * (x - 49) == 0, id="the outline of a rectangle"),
+        pytest.param(lambda y, x: (y % 23 == 4) & (x == 3 * (y // 23)), id="rows without differences between others"),
     ],
 )
-def test_what_is_equal_is_left_out_and_changes_nothing(
+def test_skipping_equal_pixels_does_not_change_the_loss(
     differs: Callable[[Tensor, Tensor], Tensor], level: float | None, isa: str
 ) -> None:
     image, target = pair(60, 50)
@@ -144,12 +142,12 @@ def test_what_is_equal_is_left_out_and_changes_nothing(
         value, gradient = with_gradient(ours, image, target)
         expected, expected_gradient = with_gradient(plain, image, target)
         torch.testing.assert_close(value, expected, rtol=0, atol=1e-12)
-        # The oracle's own rounding where nothing differs: 24 moments <= 1 through the smallest divisor C2, in float64.
+        # The oracle's own rounding in equal parts: 24 moments <= 1 through the smallest divisor C2, in float64.
         noise = 24 * 2.0**-53 / SSIM_C2 / image.numel()
         assert ((gradient - expected_gradient).abs() <= 1e-12 * expected_gradient.abs().max() + noise).all()
 
 
-def test_a_number_that_is_none_is_a_difference() -> None:
+def test_nan_counts_as_a_difference() -> None:
     image, _ = pair(40, 40)
     target = image.clone()
     image[20, 20, 1] = torch.nan
@@ -163,7 +161,7 @@ def test_gradcheck_passes() -> None:
     assert torch.autograd.gradcheck(lambda x: ssim(x, target), image.clone().requires_grad_())
 
 
-def test_misuse_is_named() -> None:
+def test_misuse_is_refused_by_name() -> None:
     image, target = pair(4, 4)
     with pytest.raises(ValueError, match=r"image must have shape \(H, W, 3\)"):
         ssim(image[..., 0], target)
