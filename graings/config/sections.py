@@ -1,8 +1,7 @@
 """The sections of the options: every number a user may set, with default, bounds and a description.
 
-Each section is read by one package, named in its docstring. Marks are iterations of the paper's schedule of 30 000
-iterations; they are scaled with `iterations`, so that a shorter run has the same proportions. Descriptions are shown
-by `graings options`.
+Each section is read by one package, named in its docstring. Iterations "in a schedule of 30 000", the paper's, are
+scaled with `iterations`, so that a shorter run has the same proportions. Descriptions are shown by `graings options`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ FirstAndLast = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)
 
 
 class CaptureConfig(ConfigSection):
-    """How images are read. Owner: `graings.capture`."""
+    """How images are read. Read by `graings.capture`."""
 
     max_side: int | None = Field(
         400,
@@ -191,10 +190,10 @@ class DensityConfig(ConfigSection):
     """Growing and pruning of anchors. Read by `graings.training.density`."""
 
     statistics_from: int = Field(
-        500, ge=0, description="Mark of the first iteration that counts for the growth statistics."
+        500, ge=0, description="First iteration of the growth statistics, in a schedule of 30 000."
     )
-    grow_from: int = Field(1_500, ge=0, description="Mark of the first growth.")
-    grow_until: int = Field(20_000, ge=0, description="Mark of the last growth.")
+    grow_from: int = Field(1_500, ge=0, description="Iteration of the first growth, in a schedule of 30 000.")
+    grow_until: int = Field(20_000, ge=0, description="Iteration of the last growth, in a schedule of 30 000.")
     grow_every: int = Field(50, ge=1, description="Iterations between growths (not scaled).")
     gradient_threshold: float = Field(
         2e-4, gt=0, description="tau_g: mean screen-space gradient, NDC units, above which a child grows new anchors."
@@ -217,8 +216,8 @@ class DensityConfig(ConfigSection):
     memory_mb: int = Field(
         4096, ge=1, description="Memory budget for the anchors and one training step, MB; growth stops at it."
     )
-    prune_from: int = Field(24_600, ge=0, description="Mark of the first pruning, about 80 % of the joint phase.")
-    prune_until: int = Field(29_000, ge=0, description="Mark of the last pruning.")
+    prune_from: int = Field(24_600, ge=0, description="Iteration of the first pruning, in a schedule of 30 000.")
+    prune_until: int = Field(29_000, ge=0, description="Iteration of the last pruning, in a schedule of 30 000.")
     prune_every: int = Field(500, ge=1, description="Iterations between prunings.")
     prune_opacity: float = Field(
         0.005, ge=0, description="Anchors whose summed child opacity stays below this are removed."

@@ -35,13 +35,13 @@ class TrainConfig(ConfigSection):
         "once per step, and learning rates are multiplied by the cube root of the batch.",
     )
     warmup: int = Field(
-        1_000, ge=0, description="Length of the static warm-up, T_w, in the schedule of 30 000; the paper has 3 000."
+        1_000, ge=0, description="Length of the static warm-up T_w, in a schedule of 30 000; the paper has 3 000."
     )
     average_from: int = Field(
         29_000,
         ge=0,
-        description="Mark after which parameters are averaged over iterations, once growth and pruning have ended; the "
-        "trained model is this average. 30000: no averaging.",
+        description="Iteration, in a schedule of 30 000, after which parameters are averaged, once growth and pruning "
+        "have ended; the trained model is this average. 30000: no averaging.",
     )
     time_window: float | None = Field(
         None,
@@ -52,13 +52,13 @@ class TrainConfig(ConfigSection):
         "missing later, training restarts with a smaller one.",
     )
     time_window_until: int = Field(
-        7_500, ge=0, description="Mark at which the time window has widened to the whole clip."
+        7_500, ge=0, description="Iteration, in a schedule of 30 000, at which the time window covers the whole clip."
     )
     low_resolution_until: int = Field(
         0,
         ge=0,
-        description="Mark until which training uses reduced images: half of each side, a quarter before that, and "
-        "so on, as long as 200 px remain. 0: full resolution from the start.",
+        description="Iteration, in a schedule of 30 000, until which training uses reduced images: half of each side, "
+        "a quarter before that, and so on, as long as 200 px remain. 0: full resolution from the start.",
     )
     matrix_optimizer: Literal["muon", "adam"] = Field(
         "muon",
