@@ -111,7 +111,7 @@ class Entries:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """An image [height, width, 5] (colour, alpha, depth) and the graph's ends that gradients are asked for."""
+    """An image [height, width, 5] (colour, alpha, depth) and the leaves of the graph."""
 
     image: Tensor
     leaves: dict[str, Tensor]

@@ -27,7 +27,7 @@ def loss_and_gradient(image: Tensor, target: Tensor, weight: float = WEIGHT) -> 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("level", [0.0, 0.6, 1.0])
 def test_nearly_equal_flat_images_have_no_loss(level: float, dtype: torch.dtype, isa: str) -> None:
-    """flat images that nearly agree; E[x^2] - E[x]^2 is below 0 for some of them."""
+    """Flat images that nearly agree; E[x^2] - E[x]^2 is below 0 for some of them."""
     image = torch.full((24, 24, 3), level, dtype=dtype)
     for target in (image, image + 1e-7):
         value, gradient = loss_and_gradient(image, target)
@@ -42,7 +42,7 @@ def test_nearly_equal_flat_images_have_no_loss(level: float, dtype: torch.dtype,
 def test_black_against_white_has_the_largest_loss_and_a_finite_gradient(
     size: tuple[int, int], dtype: torch.dtype, isa: str
 ) -> None:
-    """the loss of the worst pair there is."""
+    """The largest possible loss."""
     black, white = torch.zeros(*size, 3, dtype=dtype), torch.ones(*size, 3, dtype=dtype)
     for image, target in ((black, white), (white, black)):
         value, gradient = loss_and_gradient(image, target)
@@ -55,7 +55,7 @@ def test_black_against_white_has_the_largest_loss_and_a_finite_gradient(
 @pytest.mark.parametrize("where", ["image", "target"])
 @pytest.mark.parametrize("weight", [0.0, WEIGHT, 1.0])
 def test_a_non_finite_pixel_gives_a_non_finite_loss(weight: float, where: str, bad: float, isa: str) -> None:
-    """a finite loss of an image with a hole would hide the hole from whoever checks the loss."""
+    """A finite loss of an image with a hole would hide the hole from checks of the loss."""
     image, target = torch.full((20, 20, 3), 0.4), torch.full((20, 20, 3), 0.5)
     (image if where == "image" else target)[7, 9, 1] = bad
     value, _ = loss_and_gradient(image, target, weight)
@@ -65,7 +65,7 @@ def test_a_non_finite_pixel_gives_a_non_finite_loss(weight: float, where: str, b
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("weight", [0.0, WEIGHT, 1.0])
 def test_an_image_equal_to_its_target_has_no_gradient(weight: float, dtype: torch.dtype, isa: str) -> None:
-    """render == target. The absolute difference is flat there to the bit, SSIM to the rounding of its terms."""
+    """The gradient of L1 is exactly 0 there, and that of SSIM up to the rounding of its terms."""
     batch, camera = overlapping()
     batch = cast(batch, dtype)
     leaves = {name: getattr(batch, name).clone().requires_grad_() for name in FLOATS}

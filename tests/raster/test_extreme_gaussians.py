@@ -22,7 +22,7 @@ from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RenderResult
 from tests.raster.comparison import BACKGROUND, draw, relative, upstream
 from tests.raster.evidence import within
-from tests.raster.matrix import SMOOTH, assert_single_precision_holds, central_differences, forward_bound
+from tests.raster.extremes import SMOOTH, assert_single_precision_holds, central_differences, forward_bound
 from tests.scenes import FLOATS, cast, gaussians, pinhole, rows
 
 DTYPES = [torch.float32, torch.float64]
@@ -131,7 +131,7 @@ def test_the_footprint_of_a_needle_keeps_ten_digits(length: float) -> None:
 
 
 def test_gaussians_without_extent_have_the_footprint_of_the_low_pass_filter() -> None:
-    """all scales e^-80. Only the blur is left, and no gradient reaches a scale."""
+    """All scales are e^-80: only the low-pass filter remains, and no gradient reaches a scale."""
     batch, camera = gaussians(1, 40, spread=0.1, opacity=(0.8, 0.8)), pinhole()
     batch = replace(batch, log_scales=torch.full_like(batch.log_scales, -80.0))
     ours = draw(rasterize, batch, camera, upstream(camera))
@@ -146,7 +146,7 @@ def test_gaussians_without_extent_have_the_footprint_of_the_low_pass_filter() ->
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_the_flat_axis_of_a_disc_has_no_gradient(dtype: torch.dtype) -> None:
-    """s = (1, 1, e^-80)."""
+    """The scales are (1, 1, e^-80)."""
     batch, camera = cast(gaussians(30, 41), dtype), pinhole()
     log_scales = torch.zeros_like(batch.log_scales)
     log_scales[:, 2] = -80.0
@@ -159,7 +159,7 @@ def test_the_flat_axis_of_a_disc_has_no_gradient(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("log_scale", [-30.0, -10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 44.0, 60.0, 88.0, 89.0, math.inf])
 def test_any_scale_is_drawn_or_culled_and_the_image_stays_finite(log_scale: float, dtype: torch.dtype) -> None:
-    """isotropic and along one axis; drawn at least up to e^44, a scale that is not finite is counted."""
+    """Isotropic and along one axis; drawn at least up to e^44, and culled if not finite."""
     camera = pinhole()
     for axes in (slice(0, 3), slice(1, 2)):
         batch = cast(gaussians(20, 42, log_scales=(-2.0, -1.0)), dtype)
@@ -184,7 +184,7 @@ def test_any_scale_is_drawn_or_culled_and_the_image_stays_finite(log_scale: floa
 
 @pytest.mark.parametrize(("field", "column"), SLOTS, ids=[f"{field}{column}" for field, column in SLOTS])
 def test_an_extreme_or_non_finite_number_affects_only_its_gaussian(field: str, column: int) -> None:
-    """whatever stands in one slot of one of 120, everything is finite; culled, it might as well not be there."""
+    """For any value of one number of one of 120 Gaussians, all results are finite; if culled, it has no effect."""
     info = torch.finfo(torch.float32)
     values = (math.nan, -math.nan, math.inf, -math.inf, 0.0, -0.0, info.tiny, 1e-40, info.eps, 1e20, -1e20, 1e38, -1e38)
     batch, camera = cast(gaussians(120, 43), torch.float32), pinhole()
@@ -214,7 +214,7 @@ def test_an_extreme_or_non_finite_number_affects_only_its_gaussian(field: str, c
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_opacities_around_the_thresholds_are_culled_kept_and_capped(dtype: torch.dtype) -> None:
-    """a Gaussian whose centre is the centre of a pixel."""
+    """A Gaussian whose centre is the centre of a pixel."""
     scalar = np.float32 if dtype == torch.float32 else np.float64
     least = scalar(ALPHA_MIN)
     below, above = np.nextafter(least, scalar(0)), np.nextafter(least, scalar(1))
@@ -235,7 +235,7 @@ def test_opacities_around_the_thresholds_are_culled_kept_and_capped(dtype: torch
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_nothing_at_or_behind_the_near_plane_is_drawn(dtype: torch.dtype) -> None:
-    """at the camera, one step before, on and behind the near plane, behind the camera, far to the side."""
+    """At the camera, one ulp before, on and behind the near plane, behind the camera, far to the side."""
     scalar = np.float32 if dtype == torch.float32 else np.float64
     on = scalar(NEAR)
     camera = pinhole()
@@ -258,7 +258,7 @@ def test_nothing_at_or_behind_the_near_plane_is_drawn(dtype: torch.dtype) -> Non
 
 @pytest.mark.parametrize(("copies", "opacity"), [(1000, 0.05), (5000, 0.004)])
 def test_weights_and_transmittance_of_a_deep_stack_add_up_to_one(copies: int, opacity: float) -> None:
-    """white Gaussians before a white background, and how much light is left where nothing stops."""
+    """White Gaussians in front of a white background, with and without a stop."""
     batch = rows(one((0.0, 0.0, 2.0), log_scales=(1.0, 1.0, 1.0), opacity=opacity), torch.zeros(copies).long())
     batch = cast(replace(batch, colors=torch.ones(copies, 3).double(), uids=torch.arange(copies)), torch.float32)
     camera = pinhole(4, 4)
@@ -278,7 +278,7 @@ def test_weights_and_transmittance_of_a_deep_stack_add_up_to_one(copies: int, op
 @pytest.mark.parametrize("width", [40, 1000])
 @pytest.mark.parametrize("centre", [-1, 0, 2])
 def test_very_wide_and_off_centre_cameras_stay_within_the_bounds(width: int, centre: int) -> None:
-    """a focal length of 5 px, the principal point a whole image to the side."""
+    """A focal length of 5 px, the principal point up to an image width outside."""
     camera = pinhole(width, 1, focal=5.0, cx=float(centre * width), cy=0.5)
     batch = gaussians(30, 44, log_scales=(-2.0, 0.0))
     # spread over the image, which the principal point has left
@@ -292,7 +292,7 @@ def test_very_wide_and_off_centre_cameras_stay_within_the_bounds(width: int, cen
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("share", [1.05, 1.29, 1.31, 3.0, 10.0])
 def test_outside_the_image_the_gradient_is_that_of_the_clamped_projection(share: float, axis: int) -> None:
-    """at `share` of half the field of view; 1.3 is where the ratio is clamped before the Jacobian."""
+    """At `share` of half the field of view; 1.3 is where the ratio is clamped before the Jacobian."""
     camera = pinhole(24, 16, focal=8.0)
     half = (camera.width, camera.height)[axis] / (2 * camera.fx)
     mean, scales = [0.1, 0.15, 1.1], [0.3, 0.1, 0.5]
@@ -310,7 +310,6 @@ def test_outside_the_image_the_gradient_is_that_of_the_clamped_projection(share:
 
 
 def test_all_fourteen_gradients_of_a_gaussian_equal_central_differences() -> None:
-    """number by number."""
     camera = pinhole(24, 16, focal=20.0)
     batch = one((0.1, -0.07, 2.0), log_scales=(-1.0, -1.6, -0.6), opacity=0.6)
     cotangent = upstream(camera, 5)

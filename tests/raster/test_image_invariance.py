@@ -23,7 +23,7 @@ from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from tests.raster.comparison import BACKGROUND, Drawing, decisions, draw, relative, upstream
 from tests.raster.evidence import within
-from tests.raster.matrix import FLIP, PeakMemory, forward_bound
+from tests.raster.extremes import FLIP, PeakMemory, forward_bound
 from tests.scenes import FLOATS, SCENES, Scene, cast, deep_stack, gaussians, overlapping, pinhole, rows
 
 IMAGES = ("color", "alpha", "depth")
@@ -61,7 +61,7 @@ def product(left: Tensor, right: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_position_of_tiles_does_not_matter(seed: int) -> None:
-    """the same window of a larger image, its first pixel in every phase of a tile."""
+    """The same window of a larger image, at every offset relative to the tiles."""
     settings = replace(DEFAULT_SETTINGS, frustum_margin=1e6)  # the clamp depends on where the image ends
     batch = gaussians(60, seed, log_scales=(-4.0, -0.5))
     small = pinhole(21, 19)
@@ -84,7 +84,7 @@ def test_the_position_of_tiles_does_not_matter(seed: int) -> None:
 def test_a_footprint_that_ends_at_the_edge_of_a_tile_is_treated_alike_everywhere(
     direction: tuple[int, int], dtype: torch.dtype
 ) -> None:
-    """variance 1, o = e^4.5 / 255 give alpha = 1/255 three pixels from the centre, to rounding.
+    """Variance 1, o = e^4.5 / 255 give alpha = 1/255 three pixels from the centre, to rounding.
 
     The centre takes every place in a tile, so that this pixel lies in the same tile or the next. Distances are rounded
     relative to a block, so a few units in the last place may decide either way, but forward and backward alike; 64 of
@@ -122,7 +122,7 @@ def test_a_footprint_that_ends_at_the_edge_of_a_tile_is_treated_alike_everywhere
 
 
 def test_a_gaussian_crosses_the_edge_of_a_tile_without_a_jump() -> None:
-    """in steps of a thousandth of a pixel. o G has slope 0.607 / sqrt(0.3) = 1.11 at most; 1/255 is the cut."""
+    """In steps of a thousandth of a pixel. o G has slope 0.607 / sqrt(0.3) = 1.11 at most; 1/255 is the cut."""
     batch = replace(
         gaussians(1, 60, spread=0.0, opacity=(1.0, 1.0)), log_scales=torch.full((1, 3), -9.0, dtype=torch.float64)
     )
@@ -225,7 +225,7 @@ def test_opacity_has_no_gradient_if_everything_has_one_colour(build: Callable[[]
 
 @pytest.mark.parametrize("name", SCENES)
 def test_every_pixel_is_a_convex_combination(name: str) -> None:
-    """weights and the rest of the light add up to 1, alpha and colours stay in their range."""
+    """Weights and transmittance add up to 1, and alpha and colours stay in their range."""
     batch, camera = SCENES[name]()
     batch = cast(batch, torch.float32)
     bound = forward_bound(decisions(cast(batch, torch.float64), camera).deepest)
@@ -241,7 +241,7 @@ def test_every_pixel_is_a_convex_combination(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["overlapping", "deep_stack", "opaque"])
 def test_transmittance_never_rises_as_gaussians_are_added_behind(name: str) -> None:
-    """the transmittance never rises, not by a bit."""
+    """To the last bit."""
     batch, camera = SCENES[name]()
     batch = cast(batch, torch.float32)
     batch = rows(batch, batch.means[:, 2].argsort())
@@ -325,7 +325,7 @@ def test_moving_scene_and_camera_together_gives_the_same_image() -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("exponent", [-13, -3, 3, 10, 17])
 def test_lengths_times_a_power_of_two_give_the_same_bits(exponent: int, dtype: torch.dtype) -> None:
-    """positions and near plane, with scales that the blur outweighs: rho + k ln 2 is not exact, so see below."""
+    """Positions and near plane, with scales that the blur outweighs: rho + k ln 2 is not exact, so see below."""
     factor = 2.0**exponent
     batch, camera = gaussians(60, 64), pinhole()
     batch = cast(replace(batch, log_scales=torch.full_like(batch.log_scales, -60.0)), dtype)
@@ -351,7 +351,7 @@ def test_lengths_times_a_power_of_two_give_the_same_bits(exponent: int, dtype: t
 
 @pytest.mark.parametrize("exponent", [-13, -3, 3, 10, 17])
 def test_scaling_positions_and_scales_together_gives_the_same_image(exponent: int) -> None:
-    """rho + k ln 2 rounds to 2^-52 of itself, which twelve digits of a image in double do not see."""
+    """rho + k ln 2 has a relative rounding error of 2^-52, which does not show in twelve digits of the image."""
     factor = 2.0**exponent
     batch, camera = overlapping()
     scaled = replace(batch, means=batch.means * factor, log_scales=batch.log_scales + exponent * math.log(2))
@@ -365,7 +365,7 @@ def test_scaling_positions_and_scales_together_gives_the_same_image(exponent: in
 
 @pytest.mark.parametrize("name", ["overlapping", "needles", "off_centre", "wide"])
 def test_a_mirrored_scene_gives_the_mirrored_image(name: str) -> None:
-    """x -> -x and cx -> W - cx; a rotation keeps w and x of its quaternion and turns the other two around."""
+    """x -> -x and cx -> W - cx; the quaternion of a rotation keeps w and x and negates y and z."""
     batch, camera = SCENES[name]()
     batch = cast(batch, torch.float32)
     choice = decisions(cast(batch, torch.float64), camera)
@@ -393,7 +393,7 @@ def clean_drawing(request: pytest.FixtureRequest) -> tuple[Gaussians, Camera, Dr
 def test_previous_memory_contents_do_not_matter(
     clean_drawing: tuple[Gaussians, Camera, Drawing], dirty_memory: None
 ) -> None:
-    """twenty times, with 1, 2, 4 and 8 threads in turn."""
+    """Twenty times, with 1, 2, 4 and 8 threads in turn."""
     batch, camera, clean = clean_drawing
     assert torch.empty(1 << 16).isnan().all(), "the memory is not dirty"
     cotangent = upstream(camera)
@@ -402,7 +402,7 @@ def test_previous_memory_contents_do_not_matter(
 
 
 def test_previous_memory_contents_do_not_matter_where_nothing_is_drawn(dirty_memory: None) -> None:
-    """early exits leave no holes, forward or backward."""
+    """Early exits write all outputs, forward and backward."""
     camera = pinhole(35, 18)
     visible = gaussians(5, 66, spread=0.02, log_scales=(-5.0, -4.0))  # the middle tiles only
     for batch in (visible, replace(visible, means=-visible.means), gaussians(0, 66)):
@@ -415,7 +415,7 @@ def test_previous_memory_contents_do_not_matter_where_nothing_is_drawn(dirty_mem
 
 
 def test_many_gaussians_are_sorted_alike_by_any_number_of_threads() -> None:
-    """enough of them that threads share the sort, at 97 depths, so that uids decide among hundreds."""
+    """40 000 Gaussians at 97 depths: threads share the sort, and uids decide among hundreds of equal depths."""
     count, camera = 40_000, pinhole()
     batch = cast(gaussians(count, 69, log_scales=(-6.0, -4.0), opacity=(0.05, 0.5)), torch.float32)
     means = batch.means.clone()
@@ -436,7 +436,7 @@ def test_many_gaussians_are_sorted_alike_by_any_number_of_threads() -> None:
 
 
 def test_swapping_two_gaussians_in_depth_changes_a_pixel_by_their_overlap() -> None:
-    """equal depth, the camera turned by a billionth either way: the jump is T a_i a_j |c_i - c_j|."""
+    """Equal depth, the camera turned by a billionth either way: the jump is T a_i a_j |c_i - c_j|."""
     batch = gaussians(2, 67, spread=0.0, log_scales=(-1.5, -1.0), opacity=(0.7, 0.7))
     means = torch.tensor([[-0.1, 0.0, 3.0], [0.1, 0.0, 3.0]], dtype=torch.float64)
     batch = replace(batch, means=means, colors=torch.tensor([[0.9, 0.1, 0.4], [0.2, 0.8, 0.3]], dtype=torch.float64))
