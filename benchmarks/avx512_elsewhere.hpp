@@ -1,5 +1,5 @@
-// The functions of AVX-512 that the kernel calls, for a CPU that has AVX2: most by SIMDe, which is correct there; the
-// others, which SIMDe 0.7 lacks or has wrong, number by number. A register is a vector of 64 bytes that GCC splits.
+// The AVX-512 intrinsics that the kernel calls, for a CPU with AVX2. Most come from SIMDe; those that SIMDe 0.7 lacks or
+// implements incorrectly are written here, element by element. A register is a vector of 64 bytes that GCC splits.
 #pragma once
 #include <cstring>
 #include <immintrin.h>
@@ -34,7 +34,7 @@ static inline __m256i cvttpd_epi32(const __m512d& a) {
 static inline __m256i cvttpd_epu32(const __m512d& a) {
     return each<__m256i>(a, [](double x) { return x > -1.0 && x < 4294967296.0 ? uint32_t(x) : UINT32_MAX; });
 }
-// Both are asked for whole numbers below alone.
+// Both are only called for rounding towards minus infinity.
 static inline __m512d roundscale_pd(const __m512d& a, int) { return each<__m512d>(a, [](double x) { return __builtin_floor(x); }); }
 static inline __m512 reduce_ps(const __m512& a, int) {
     return each<__m512>(a, [](float x) { return __builtin_isinf(x) ? 0.0f : x - __builtin_floorf(x); });

@@ -1,12 +1,12 @@
-"""Runs the kernel's tests on its AVX-512 branches where the CPU has AVX2 alone.
+"""Runs the kernel's tests on its AVX-512 code on a CPU that has only AVX2.
 
     python benchmarks/avx512_elsewhere.py [pytest's arguments]
 
-Works in a copy of the package in a temporary folder. There the kernel of AVX-512 is compiled for AVX2; the functions of
-AVX-512 come from SIMDe (Debian: libsimde-dev) and avx512_elsewhere.hpp. So it tries what the source says, not what a
-compiler makes of it for AVX-512. Without further arguments tests/raster and tests/scene run; the exit code is pytest's.
+Works in a copy of the package in a temporary folder, where the AVX-512 code is compiled for AVX2; its intrinsics are
+emulated by SIMDe (Debian: libsimde-dev) and avx512_elsewhere.hpp. This tests the source, not the compiler's output
+for AVX-512. Without further arguments tests/raster and tests/scene run; the exit code is pytest's.
 
-Says nothing of speed: the copy is many times slower. Needs GCC, CMake and nanobind.
+It does not measure speed: the copy is many times slower. Needs GCC, CMake and nanobind.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from working_copy import WorkingCopy
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = "graings/kernel/csrc"
-BY_HAND = Path(__file__).with_suffix(".hpp")
+OWN_HEADER = Path(__file__).with_suffix(".hpp")
 FUNCTION = re.compile(r"_mm512_(\w+)")
 OWN_FUNCTION = re.compile(r"^static inline \S+ (\w+)\(", re.MULTILINE)
 FLAGS = re.compile(r"add_kernels\(avx512 [^)]*\)")
 
 
 def header() -> str:
-    """The functions by hand, and a name for every function of AVX-512 that the kernel calls."""
-    by_hand = BY_HAND.read_text(encoding="utf-8")
-    own = set(OWN_FUNCTION.findall(by_hand))
+    """The own functions, and a macro for every AVX-512 intrinsic that the kernel calls."""
+    own_header = OWN_HEADER.read_text(encoding="utf-8")
+    own = set(OWN_FUNCTION.findall(own_header))
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / SOURCES).glob("*.hpp")]
     called = sorted({name for source in sources for name in FUNCTION.findall(source)})
     names = [
         f"#undef _mm512_{name}\n#define _mm512_{name} {'elsewhere::' if name in own else 'simde_mm512_'}{name}\n"
         for name in called
     ]
-    return by_hand + "".join(names)
+    return own_header + "".join(names)
 
 
 def build(folder: Path) -> WorkingCopy:
-    """A copy whose kernel of AVX-512 runs here. Raises `SystemExit` where it cannot be built."""
+    """A copy whose AVX-512 kernel runs here. Raises `SystemExit` if it cannot be built."""
     included = folder / "avx512.hpp"
     included.write_text(header(), encoding="utf-8")
     (folder / "copy").mkdir()
@@ -54,8 +54,8 @@ def build(folder: Path) -> WorkingCopy:
         raise SystemExit(f"the flags of avx512 occur {count} times in CMakeLists.txt, expected once")
     cmake.write_text(changed, encoding="utf-8")
     isa = copy.folder / SOURCES / "isa.cpp"
-    said = "#define __builtin_cpu_supports(feature) true\n"
-    isa.write_text(said + isa.read_text(encoding="utf-8"), encoding="utf-8")
+    override = "#define __builtin_cpu_supports(feature) true\n"
+    isa.write_text(override + isa.read_text(encoding="utf-8"), encoding="utf-8")
     copy.build()
     return copy
 

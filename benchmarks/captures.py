@@ -1,9 +1,9 @@
-"""Which captures load, and what is said of those that do not.
+"""Which captures load, and the error messages of those that do not.
 
     python benchmarks/captures.py CAPTURE [CAPTURE ...]
 
-Loads every capture named and decodes one image of each; then writes a small synthetic capture, breaks copies
-of it in a dozen ways and prints the message of each. Fails when a broken one loads.
+Loads each given capture and decodes one image of it; then writes a small synthetic capture, damages copies of it in
+a dozen ways and prints the error message of each. Fails if a damaged one loads.
 """
 
 from __future__ import annotations

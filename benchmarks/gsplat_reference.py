@@ -8,18 +8,18 @@ DIR holds `bench_scene.py` with `make_scene(n)`, `camera(size, dist=...)` and `t
 
 Only the file `gsplat/cuda/_torch_impl.py` is loaded, by its path: the package itself would look for a CUDA compiler
 when imported, and this file needs nothing but torch (the extra `bench` pins the version of gsplat whose rules are
-written down here; `pip install --no-deps` of that version is enough). Projection, covariances, footprint, tile lists
-and `accumulate`, the blending, are the package's. Two things it borrows from CUDA are replaced by torch code of our
-own: `rasterize_to_indices_in_range`, which decides which Gaussians a pixel blends (same rules as that CUDA kernel:
-alpha below 1/255 is skipped, and the Gaussian that would leave 1e-4 of the light or less ends the pixel and is not
-blended), and the two functions of `nerfacc` that `accumulate` calls.
+implemented here; `pip install --no-deps` of that version is enough). Projection, covariances, footprint, tile lists
+and `accumulate`, the blending, are the package's. Two CUDA functions that it uses are replaced by our own
+torch code: `rasterize_to_indices_in_range`, which decides which Gaussians a pixel blends (by the rules of that kernel:
+alpha below 1/255 is skipped, and the Gaussian that would reduce the transmittance to 1e-4 or less ends the pixel and is
+not blended), and the two functions of `nerfacc` that `accumulate` calls.
 
-Views: `whole` is the scene from outside; `close` stands inside it, off-centre and not square, with opacities of one, so
-that near plane, clamp of the Jacobian, culling and alpha cap all take part.
+Views: `whole` is the scene from outside; `close` is inside it, off-centre and not square, with opacities of one, so
+that near plane, clamp of the Jacobian, culling and alpha cap all have an effect.
 
 Prints, for each scene: the differences of the projection; of the image under pairs of rules (the same rules on both
-sides must agree to rounding, and a pair that differs by one rule shows what that rule does); what lies behind each
-pixel that differs by more than 1e-4; the gradients; and, for `whole`, the times of forward + backward, taken in turn.
+sides must agree to rounding, and a pair that differs by one rule shows what that rule does); the cause of each pixel
+that differs by more than 1e-4; the gradients; and, for `whole`, the times of forward + backward, measured alternately.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from graings.kernel import use_threads
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
 
-# Constants of gsplat that it does not let a caller choose.
+# Constants of gsplat that are not parameters.
 GSPLAT_ALPHA_MIN = 1 / 255
 GSPLAT_ALPHA_MAX = 0.999
 GSPLAT_STOP = 1e-4
 GSPLAT_FAR = 1e10
 
 VISIBLE = 1e-4  # differences of a pixel above this are counted and explained
-NEAR_MISS = 1e-4  # relative distance to a threshold within which float32 may decide either way
+NEAR_MISS = 1e-4  # relative distance to a threshold within which rounding in float32 may decide
 RAYS_AT_ONCE = 2048  # rays are padded to the longest of this many: bounds the memory, keeps torch's calls few
 
 # Ours, drawn with as many of gsplat's rules as there are settings for.
@@ -69,16 +69,16 @@ LEAVES = ("means", "quats", "log_scales", "opacities", "colors")
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What the reference does where the two differ; the defaults are gsplat's own."""
+    """The rules in which the two differ; the defaults are those of gsplat."""
 
     square: bool = False  # footprint: a square of three deviations of the longer axis, not a box of 3.33 for each axis
-    inclusive: bool = False  # stop: the Gaussian that crosses the line is blended
-    exact_order: bool = False  # sort by the depth as it is, not by its float32 bits
+    inclusive: bool = False  # stop: the Gaussian that crosses the threshold is blended
+    exact_order: bool = False  # sort by the exact depth, not by its float32 bits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Gaussians in float64 (with values that float32 can hold), a camera and what flows back."""
+    """Gaussians in float64 (with values that float32 represents exactly), a camera and an upstream gradient."""
 
     name: str
     leaves: Mapping[str, Tensor]
@@ -93,7 +93,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """What the reference's projection gives, one row for each Gaussian."""
+    """Output of the reference's projection, one row for each Gaussian."""
 
     means2d: Tensor
     conics: Tensor
@@ -111,7 +111,7 @@ class Entries:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """An image [height, width, 5] (colour, alpha, depth) and the graph's ends that gradients are asked for."""
+    """An image [height, width, 5] (colour, alpha, depth) and the leaves of the graph."""
 
     image: Tensor
     leaves: dict[str, Tensor]
@@ -138,7 +138,7 @@ def load_gsplat() -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    stand_in: Any = ModuleType("nerfacc")  # `accumulate` imports it when called; the real one is CUDA only
+    stand_in: Any = ModuleType("nerfacc")  # `accumulate` imports it when called; the real package needs CUDA
     stand_in.render_weight_from_alpha = weights_along_rays
     stand_in.accumulate_along_rays = sums_along_rays
     sys.modules["nerfacc"] = stand_in
@@ -168,7 +168,7 @@ def sums_along_rays(weights: Tensor, values: Tensor | None, *, ray_indices: Tens
 
 
 class Reference:
-    """gsplat's torch functions put together to a rasterizer."""
+    """A rasterizer composed of gsplat's torch functions."""
 
     def __init__(self, gsplat: ModuleType) -> None:
         self.gsplat: Any = gsplat
@@ -243,7 +243,7 @@ class Reference:
         shipped_lists: bool = False,
         decided: Entries | None = None,
     ) -> Drawn:
-        """One forward pass; `decided` takes the place of the pixels' own decisions."""
+        """One forward pass; `decided` replaces the pixels' own decisions."""
         leaves = scene.inputs(dtype)
         projection = self.project(leaves, scene.camera)
         if decided is None:
@@ -318,7 +318,7 @@ def raw_alphas(projection: Projection, opacities: Tensor, ids: Tensor, pixels: T
 def blended(
     projection: Projection, opacities: Tensor, lists: Sequence[Tensor], camera: Camera, rules: Rules
 ) -> Entries:
-    """Front to back in each pixel: skip what is too faint, stop when the light is used up."""
+    """Front to back in each pixel: skip alphas below the minimum, stop at the minimum transmittance."""
     across, _ = _tiles(camera)
     gaussians, pixels = [], []
     for tile, ids in enumerate(lists):
@@ -349,7 +349,7 @@ def tile_pixels(tile: int, across: int, camera: Camera) -> Tensor:
 
 
 def near_misses(reference: Reference, scene: Scene, rules: Rules, chosen: Tensor) -> dict[str, int]:
-    """How many of the chosen pixels come, in float64, so close to a decision that float32 may take the other one."""
+    """How many of the chosen pixels come, in float64, so close to a threshold that float32 may decide differently."""
     leaves = scene.inputs(torch.float64)
     with torch.no_grad():
         projection = reference.project(leaves, scene.camera)
@@ -519,7 +519,7 @@ MOVED = (
 
 
 def rule_rows(reference: Reference, scene: Scene, loose: Scene) -> list[Row]:
-    """float64: what is left under the same rules, and what each rule that differs does."""
+    """float64: the difference under the same rules, and the effect of each rule that differs."""
     double = torch.float64
     rows = [
         difference(label, draw_ours(scene, double, settings).image, reference.draw(scene, double, rules).image)
@@ -545,7 +545,7 @@ def rule_rows(reference: Reference, scene: Scene, loose: Scene) -> list[Row]:
 
 
 def rounding_rows(reference: Reference, scene: Scene, settings: RasterSettings, rules: Rules) -> list[Row]:
-    """float32 under the same rules: who rounds, and how much remains when float64 decides what is blended."""
+    """float32 under the same rules: rounding of each side, and what remains if float64 decides what is blended."""
     single, double = torch.float32, torch.float64
     leaves = scene.inputs(double)
     with torch.no_grad():
@@ -601,7 +601,7 @@ def _apart(a: Tensor, b: Tensor) -> str:
 
 
 def time_rows(reference: Reference, scene: Scene, threads: int, rounds: int) -> list[Row]:
-    """Forward + backward of the colour, float32, all leaves, taken in turn."""
+    """Forward + backward of the colour, float32, all leaves, measured alternately."""
     upstream, single = scene.upstream[..., :3].float(), torch.float32
 
     def backward(drawn: Drawn) -> None:
@@ -620,10 +620,10 @@ def time_rows(reference: Reference, scene: Scene, threads: int, rounds: int) -> 
         "gsplat, tile lists without a Python loop": lambda: backward(reference.draw(scene, single, Rules())),
     }
     times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds + 1):  # the first warms up
+    for _ in range(rounds + 1):  # the first is a warm-up
         for name, call in calls.items():
             torch.set_num_threads(1 if name.startswith("ours") else threads)  # torch has the cores that our kernel has
-            time.sleep(0.03)  # threads of the call before may still wait for more
+            time.sleep(0.03)  # threads of the previous call may still spin
             start = time.perf_counter()
             call()
             times[name].append(1e3 * (time.perf_counter() - start))

@@ -1,25 +1,25 @@
-"""Tests the tests: breaks the formulas one at a time and asks which test notices.
+"""Mutation tests: breaks the formulas one at a time and reports which test fails.
 
     python benchmarks/mutants.py [--only a,b] [--list] [--keep DIR]
 
-A mutant is a small change of the source, "this text becomes that text". Each is applied to a copy of the package in a
-temporary folder, the kernel is built again there where C++ changed, and the fast tests run until the first one fails. A
-mutant that no test notices has survived, and the exit code is 1. The text to change must occur exactly once: after a
-formula has been rewritten, so must its mutant be, and the script says which.
+A mutant is a small change of the source, the replacement of one text by another. Each is applied to a copy of the
+package in a temporary folder, the kernel is rebuilt if C++ changed, and the fast tests run until the first one fails. A
+mutant that no test detects has survived, and the exit code is 1. The text to replace must occur exactly once; the
+script names mutants whose formula has been rewritten.
 
-Most break the rasterizer and are tried by tests/raster. Mutant (i) rounds times before they are normalised; the
-rasterizer knows no times, so it is tried by the tests of normalisation. The last five break the rest of the kernel:
-networks, positions, children, which tests/scene tries, and the loss. Mutant (e) cuts a footprint at three standard
-deviations, which in this kernel is a limit of the exponent and not a square; mutant (g) takes the position in the
-camera in float32 where pixels are float32; mutant (h) forgets the uids, so that rows decide; mutant (l) leaves flags as
-the memory was, which shows only where that was used before.
+Most break the rasterizer and are run against tests/raster. Mutant (i) rounds times before they are normalised and is
+run against the tests of normalisation. The last ones break the rest of the kernel: networks, encodings and children,
+run against tests/scene, and the loss. Mutant (e) cuts a footprint at three standard deviations, which in this kernel is
+a limit of the exponent and not a square; mutant (g) computes the position in the camera in float32 if pixels are
+float32; mutant (h) ignores the uids, so that the order of rows decides; mutant (l) leaves flags uninitialised, which
+matters only in reused memory.
 
-Mutants (j) to (m) break the way back through a tile; (n) to (p) and the five that follow break in which tiles and
-blocks a Gaussian is looked at, and in which order.
+Mutants (j) to (m) break the backward pass of a tile; (n) to (p) and the five that follow break the selection of tiles
+and blocks of a Gaussian, and their order.
 
-Tests that fail before anything is changed cannot notice a change: they are named and left out.
+Tests that fail without any mutant are named and left out.
 Needs a compiler, CMake and nanobind (pip install nanobind); takes a few minutes per mutant. Set GRAINGS_ISA to choose
-the instruction set that tests run with where they do not choose themselves.
+the instruction set that tests run with unless they select one themselves.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SOURCE = "graings/kernel/csrc"
 RASTER = ("tests/raster",)
 FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)
-IN_A_TEST = re.compile(r"^(tests/\S+::.*\S) \Z", re.MULTILINE)  # begun, and no word of how it ended
+IN_A_TEST = re.compile(r"^(tests/\S+::.*\S) \Z", re.MULTILINE)  # started, but without a result
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,8 @@ MUTANTS = (
         "factor 2 kept where the ratio is clamped",
         GEOMETRY,
         "g_z - iz * (to_x * p.ratio_x + to_y * p.ratio_y)",
-        "g_z - iz * ((g_held_x * p.held_x + fx * g_x * p.ratio_x) + (g_held_y * p.held_y + fy * g_y * p.ratio_y))",
+        "g_z - iz * ((g_clamped_x * p.clamped_x + fx * g_x * p.ratio_x)"
+        " + (g_clamped_y * p.clamped_y + fy * g_y * p.ratio_y))",
     ),
     Mutant("d", "quaternion gradient not projected", GEOMETRY, "(q[i] - radial * p.quat[i])", "(q[i])"),
     Mutant(
@@ -128,14 +129,14 @@ MUTANTS = (
     Mutant(
         "i",
         "times in float32 before they are normalised",
-        "graings/units.py",
+        "graings/camera/units.py",
         "(float(time) - self.time_start)",
         "(float(np.float32(time)) - self.time_start)",
         ("tests/capture/test_normalize.py",),
     ),
     Mutant(
         "j",
-        "light multiplied on the way back, not divided",
+        "transmittance multiplied in the backward pass, not divided",
         TILE_GRADIENT,
         "load<N>(of(light)) / (all_of(R(1)) - alpha)",
         "load<N>(of(light)) * (all_of(R(1)) - alpha)",
@@ -144,12 +145,13 @@ MUTANTS = (
         "k",
         "gradient counts entries behind the stop",
         TILE_GRADIENT,
-        "(all_of(limits.alpha_min) <= seen.raw) & (all_of(entry.number) <= load<N>(last[seen.block] + seen.first))",
-        "all_of(limits.alpha_min) <= seen.raw",
+        "(all_of(limits.alpha_min) <= evaluated.raw) & "
+        "(all_of(entry.number) <= load<N>(last[evaluated.block] + evaluated.first))",
+        "all_of(limits.alpha_min) <= evaluated.raw",
     ),
     Mutant(
         "l",
-        "what lies behind the last entry seen not said to be unseen",
+        "flags of pairs that were not drawn left uninitialised",
         FRAME,
         "std::fill_n(shown.get(), 64 * words, uint8_t(0))",
         "std::fill(shown.get() + pair_count_, shown.get() + 64 * words, uint8_t(0))",
@@ -166,9 +168,9 @@ MUTANTS = (
     ),
     Mutant(
         "o",
-        "blocks judged as if there were no tilt",
+        "blocks selected as if there were no tilt",
         TILES,
-        "p16(margin) * (wide + lean)",
+        "p16(margin) * (wide + tilt)",
         "p16(margin) * wide",
     ),
     Mutant(
@@ -187,14 +189,14 @@ MUTANTS = (
     ),
     Mutant(
         "rows-short",
-        "blocks judged as if they were a pixel less high",
+        "blocks selected as if they were a pixel less high",
         TILES,
         "p16(margin) * rise",
         "rise",
     ),
     Mutant(
         "no-slack",
-        "blocks judged without slack for rounding",
+        "blocks selected without slack for rounding",
         TILES,
         "constexpr R margin = R(1.5) + (sizeof(R) == 4 ? R(6e-5) : R(1e-13));",
         "constexpr R margin = R(1.5);",
@@ -221,29 +223,29 @@ MUTANTS = (
         "g_slope = d8(0.5) * total[kRS]",
     ),
     Mutant(
-        "place-lost",
-        "the third of a Gaussian's sums forgotten",
+        "third-sum",
+        "the third of a Gaussian's partial sums skipped",
         GEOMETRY,
         "for (uint32_t at = first + 2;",
         "for (uint32_t at = first + 3;",
     ),
     Mutant(
         "unwritten",
-        "sums of entries whose blocks have no say not written",
+        "sums of entries without an active block not written",
         TILE_GRADIENT,
-        "put_nothing(entries[j].place);",
+        "put_zeros(entries[j].place);",
         "",
     ),
     Mutant(
         "unwritten-tile",
-        "sums of a tile whose blocks have no say not written",
+        "sums of a tile without an active block not written",
         TILE_GRADIENT,
-        "put_nothing(args.pairs[k].place);",
+        "put_zeros(args.pairs[k].place);",
         ";",
     ),
     Mutant(
         "renumbered",
-        "entries numbered among those shown, not among all",
+        "entries numbered among the drawn ones, not among all",
         TILE_GRADIENT,
         "double(box.top), entries[j].key);",
         "double(box.top), j);",
@@ -257,24 +259,24 @@ MUTANTS = (
     ),
     Mutant(
         "reason",
-        "the last reason not to draw named, not the first",
+        "the last reason for culling counted, not the first",
         GEOMETRY,
-        "status = select(turned, status, d8(kZeroQuat)), status = select(finite, status, d8(kNonFinite)),",
-        "status = select(finite, status, d8(kNonFinite)), status = select(turned, status, d8(kZeroQuat)),",
+        "status = select(has_direction, status, d8(kZeroQuat)), status = select(finite, status, d8(kNonFinite)),",
+        "status = select(finite, status, d8(kNonFinite)), status = select(has_direction, status, d8(kZeroQuat)),",
     ),
     Mutant(
         "cap-passed",
         "gradient passed through the cap of alpha",
         TILE_GRADIENT,
-        "select(seen.raw <= all_of(limits.alpha_max), weight * gain, none)",
+        "select(evaluated.raw <= all_of(limits.alpha_max), weight * gain, none)",
         "weight * gain",
     ),
     Mutant(
         "j-dropped",
         "no gradient through the last column of the Jacobian",
         GEOMETRY,
-        "g_held_x = -(fx * iz * j02), g_held_y = -(fy * iz * j12);",
-        "g_held_x = d8(0) * j02, g_held_y = d8(0) * j12;",
+        "g_clamped_x = -(fx * iz * j02), g_clamped_y = -(fy * iz * j12);",
+        "g_clamped_x = d8(0) * j02, g_clamped_y = d8(0) * j12;",
     ),
     Mutant(
         "background",
@@ -292,28 +294,28 @@ MUTANTS = (
     ),
     Mutant(
         "bits-missing",
-        "what agrees in the leading bits of its key left as it came",
+        "pairs that agree in the leading bits of the key left unsorted",
         BINNING,
         "if (!before(pairs[i], pairs[i - 1])) continue;",
-        "if (before(pairs[i], pairs[i]) || count > kFew) continue;",
+        "if (before(pairs[i], pairs[i]) || count > kMaxInsertionSort) continue;",
     ),
     Mutant(
-        "moves-lost",
-        "sort broken off where it moves too much",
+        "long-sort",
+        "insertion sort ended early without a fallback",
         BINNING,
         "std::sort(pairs, pairs + count, before);",
         "",
     ),
     Mutant(
         "next-unseen",
-        "the next entry left out on the way back for one that shows nothing",
+        "the next entry dropped from the backward pass instead of an invisible one",
         TILES,
         "unseen |= uint64_t(!any(seen)) << j;",
         "unseen |= uint64_t(!any(seen)) << (j + 1) % kChunk;",
     ),
     Mutant(
         "dead-block",
-        "entries forgotten in all blocks where one block has stopped",
+        "entries dropped from all blocks when one block has stopped",
         TILES,
         "pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);",
         "pairs[k + __builtin_ctzll(list)].mask = 0;",
@@ -327,14 +329,14 @@ MUTANTS = (
     ),
     Mutant(
         "ready-places",
-        "an entry made ready in place of the one still open",
+        "an entry prepared in place of the one still in use",
         TILE_GRADIENT,
         "    constexpr int kReady = 16;\n    static_assert(kReady > kReadyAhead + 1);\n",
         "    constexpr int kReady = 9;\n",
     ),
     Mutant(
         "group-split",
-        "gradient of a group lost where pieces of work meet",
+        "gradient of a group missing at the boundary of two pieces of work",
         f"{SOURCE}/perceptron.cpp",
         "to[c] += own[args.first_group_at + c];",
         "to[c] += R(0);",
@@ -366,7 +368,7 @@ MUTANTS = (
     ),
     Mutant(
         "mirror",
-        "way back through a mirror without the turn of its normal",
+        "gradient of a reflection without the rotation of its normal",
         f"{SOURCE}/encoding.cpp",
         "out[i] = R(-2 * (along * v[i] + turned * (direction[i] - 2 * along * normal[i])));",
         "out[i] = R(-2 * (along * v[i] + turned * direction[i]));",
@@ -374,30 +376,36 @@ MUTANTS = (
     ),
     Mutant(
         "adjoint",
-        "gradient turned forwards, not back",
+        "gradient rotated forwards, not back",
         f"{SOURCE}/children.cpp",
-        "v = product(v, conjugate(turn(moved)));",
-        "v = product(v, turn(moved));",
+        "v = product(v, conjugate(deformed_rotation(deformation)));",
+        "v = product(v, deformed_rotation(deformation));",
         SCENE,
     ),
-    Mutant("rim", "differing part one pixel too narrow", f"{SOURCE}/photometric.cpp", "kReach = 5;", "kReach = 4;"),
+    Mutant(
+        "rim",
+        "differing part one pixel too narrow",
+        f"{SOURCE}/photometric.cpp",
+        "kReach = kSsimRadius;",
+        "kReach = kSsimRadius - 1;",
+    ),
     Mutant(
         "stale",
-        "what no window saw keeps another picture's gradient",
+        "gradient outside all windows left uninitialised",
         f"{SOURCE}/ssim.hpp",
         "std::memset(map, 0, sizeof(R) * size_t(args.windows[y].begin));",
         "",
     ),
     Mutant(
         "cut-off",
-        "a row's window sums only what has a say itself",
+        "row sums restricted to numbers with a difference",
         f"{SOURCE}/ssim.hpp",
-        "along<R>(reached(args.windows[y], length)",
-        "along<R>(args.windows[y]",
+        "each_register<R>(widened(args.windows[y], length)",
+        "each_register<R>(args.windows[y]",
     ),
     Mutant(
         "square",
-        "squares without the two of their gradient",
+        "factor 2 missing in the gradient of the squared difference",
         f"{SOURCE}/ssim.hpp",
         "R(2) * args.squared",
         "args.squared",
@@ -406,7 +414,7 @@ MUTANTS = (
 
 
 def apply(copy: WorkingCopy, mutant: Mutant) -> str:
-    """Change the source; returns what it was. Raises `SystemExit` where the text is not there once."""
+    """Change the source; returns the original. Raises `SystemExit` unless the text occurs exactly once."""
     path = copy.folder / mutant.file
     before = path.read_text(encoding="utf-8")
     if (count := before.count(mutant.old)) != 1:
@@ -418,7 +426,7 @@ def apply(copy: WorkingCopy, mutant: Mutant) -> str:
 def failures(copy: WorkingCopy, tests: Sequence[str], *options: str) -> list[str]:
     """Ids of the tests that fail, or of the one in which a signal ended the interpreter.
 
-    Raises `SystemExit` where they could not be run at all.
+    Raises `SystemExit` if they could not be run.
     """
     ran = copy.pytest("-v", "-m", "not slow", *options, *tests)
     failed = FAILED.findall(ran.stdout)
@@ -440,21 +448,21 @@ def chosen(only: str | None) -> list[Mutant]:
 
 
 def check_texts(mutants: Sequence[Mutant]) -> None:
-    """Before hours are spent: every text occurs once."""
+    """Check first that every text occurs exactly once."""
     for mutant in mutants:
         if (count := (ROOT / mutant.file).read_text(encoding="utf-8").count(mutant.old)) != 1:
             raise SystemExit(f"mutant {mutant.name}: its text occurs {count} times in {mutant.file}, expected once")
 
 
 def try_mutants(copy: WorkingCopy, mutants: Sequence[Mutant]) -> dict[str, str | None]:
-    """The first test that notices each mutant, None where none does."""
+    """The first test that each mutant fails, None if it survives."""
     copy.build()
     tests = sorted({test for mutant in mutants for test in mutant.tests})
     broken = failures(copy, tests)
     for test in broken:
         print(f"fails already, left out: {test}", flush=True)
     deselected = [f"--deselect={test}" for test in broken]
-    noticed: dict[str, str | None] = {}
+    detected_by: dict[str, str | None] = {}
     built_as_is = True
     for mutant in mutants:
         before = apply(copy, mutant)
@@ -463,15 +471,15 @@ def try_mutants(copy: WorkingCopy, mutants: Sequence[Mutant]) -> dict[str, str |
             built_as_is = not mutant.needs_build
         failed = failures(copy, mutant.tests, "-x", *deselected)
         (copy.folder / mutant.file).write_text(before, encoding="utf-8")
-        noticed[mutant.name] = failed[0] if failed else None
-        print(f"{mutant.name:13} {mutant.what:52} {noticed[mutant.name] or 'SURVIVED'}", flush=True)
-    return noticed
+        detected_by[mutant.name] = failed[0] if failed else None
+        print(f"{mutant.name:13} {mutant.what:52} {detected_by[mutant.name] or 'SURVIVED'}", flush=True)
+    return detected_by
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", metavar="NAMES", help="these mutants, separated by commas")
-    parser.add_argument("--list", action="store_true", help="print the mutants and check that their texts are there")
+    parser.add_argument("--list", action="store_true", help="print the mutants and check that their texts occur")
     parser.add_argument(
         "--keep", type=Path, metavar="DIR", help="work in this folder, which must not exist, and keep it"
     )
@@ -485,13 +493,13 @@ def main() -> int:
         return 0
     if options.keep is not None:
         options.keep.mkdir(parents=True)
-        noticed = try_mutants(WorkingCopy(ROOT, options.keep.resolve(), options.jobs), mutants)
+        detected_by = try_mutants(WorkingCopy(ROOT, options.keep.resolve(), options.jobs), mutants)
     else:
         with tempfile.TemporaryDirectory() as folder:
-            noticed = try_mutants(WorkingCopy(ROOT, Path(folder).resolve(), options.jobs), mutants)
-    survivors = [name for name, test in noticed.items() if test is None]
+            detected_by = try_mutants(WorkingCopy(ROOT, Path(folder).resolve(), options.jobs), mutants)
+    survivors = [name for name, test in detected_by.items() if test is None]
     print(
-        f"{len(noticed) - len(survivors)} of {len(noticed)} noticed"
+        f"{len(detected_by) - len(survivors)} of {len(detected_by)} detected_by"
         + (f"; survived: {', '.join(survivors)}" * bool(survivors))
     )
     return 1 if survivors else 0

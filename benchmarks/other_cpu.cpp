@@ -1,6 +1,6 @@
-// Draws, compares and runs a network on made-up numbers, and writes what comes out: for each array a line with its name
-// and length, then its numbers as float64. A program of its own, so that it runs where no interpreter is
-// (other_cpu.py). Numbers come from integers alone, so that every CPU begins with the same.
+// Runs the rasterizer, the loss and a network on generated inputs and writes the results: for each array a line with its
+// name and length, then its numbers as float64. A stand-alone program for CPUs without an interpreter (other_cpu.py).
+// Inputs are generated from integers, so that they are the same on every CPU.
 #include <cstdint>
 #include <cstdio>
 #include <string>
@@ -41,13 +41,13 @@ void write(const char* name, const std::vector<R>& numbers) {
 }
 
 template <class R>
-void pictures() {
-    constexpr int64_t count = 3000, width = 163, height = 118, pixels = width * height;  // tiles cut off at both ends
+void images() {
+    constexpr int64_t count = 3000, width = 163, height = 118, pixels = width * height;  // with incomplete tiles
     Numbers from;
     auto means = from.many<R>(3 * count, -1.5, 1.5), quats = from.many<R>(4 * count, -1, 1), log_scales = from.many<R>(3 * count, -6, -2);
     const auto opacities = from.many<R>(count, 0, 1), colors = from.many<R>(3 * count, 0, 1), background = from.many<R>(3, 0, 1);
     for (int64_t i = 0; i < count; i++) means[size_t(3 * i + 2)] += R(4);
-    for (int64_t i = 0; i < 100; i++) log_scales[size_t(3 * i)] = R(1);  // needles across the picture
+    for (int64_t i = 0; i < 100; i++) log_scales[size_t(3 * i)] = R(1);  // needles across the image
     std::vector<int64_t> uids(count);
     for (int64_t i = 0; i < count; i++) uids[size_t(i)] = i;
     const graings::Camera camera{{1, 0, 0, 0, 1, 0, 0, 0, 1}, {0, 0, 0}, 180, 180, 80.5, 60.25, width, height};
@@ -71,7 +71,7 @@ void pictures() {
     };
     const auto other = from.many<R>(3 * pixels, 0, 1);
     comparison("other", other);
-    std::vector<R> partly = color;  // differs in a slanted stripe: another part of each row, and none of some
+    std::vector<R> partly = color;  // differs in a slanted stripe: in another range of each row, and in some rows not at all
     for (int64_t i = 0; i < pixels; i++)
         if (const int64_t x = i % width, y = i / width; y > 20 && y < 90 && (x + 2 * y) % 97 < 3)
             for (int64_t c = 3 * i; c < 3 * i + 3; c++) partly[size_t(c)] = other[size_t(c)];
@@ -115,25 +115,25 @@ template <class R>
 void children() {
     constexpr int64_t anchors = 60, slots = 10, drawn = anchors * slots;
     Numbers from;
-    const auto place = from.many<R>(3 * anchors, -1, 1), log_scale = from.many<R>(3 * anchors, -4, -2), offset = from.many<R>(3 * drawn, -1, 1);
+    const auto position = from.many<R>(3 * anchors, -1, 1), log_scale = from.many<R>(3 * anchors, -4, -2), offset = from.many<R>(3 * drawn, -1, 1);
     std::vector<int64_t> numbers(drawn);
     for (int64_t i = 0; i < drawn; i++) numbers[size_t(i)] = i;
     std::vector<R> row(size_t(drawn * (3 + slots))), centre(3 * drawn), base(3 * drawn), mean(3 * drawn), quat(4 * drawn), size(3 * drawn);
-    graings::gather<R>({anchors, slots, place.data(), log_scale.data(), offset.data()}, drawn, numbers.data(), row.data(), centre.data(), base.data(), 2);
-    const auto canonical = from.many<R>(7 * drawn, -0.5, 0.5), moved = from.many<R>(10 * drawn, -0.5, 0.5);
-    const graings::Answers<R> answers{drawn, canonical.data(), base.data(), centre.data(), moved.data(), 1.5, {0.3, -8, 0, true}};
-    graings::compose<R>(answers, mean.data(), quat.data(), size.data(), 2);
+    graings::gather<R>({anchors, slots, position.data(), log_scale.data(), offset.data()}, drawn, numbers.data(), row.data(), centre.data(), base.data(), 2);
+    const auto canonical = from.many<R>(7 * drawn, -0.5, 0.5), deformation = from.many<R>(10 * drawn, -0.5, 0.5);
+    const graings::NetworkOutputs<R> outputs{drawn, canonical.data(), base.data(), centre.data(), deformation.data(), 1.5, {0.3, -8, 0, true}};
+    graings::compose<R>(outputs, mean.data(), quat.data(), size.data(), 2);
     write("centre", centre), write("mean", mean), write("quat", quat), write("log_scale", size);
     const auto v_mean = from.many<R>(3 * drawn, -1, 1), v_quat = from.many<R>(4 * drawn, -1, 1), v_size = from.many<R>(3 * drawn, -1, 1);
-    std::vector<R> v_canonical(7 * drawn), v_moved(10 * drawn), v_log_scale(3 * anchors), v_offset(3 * drawn);
-    graings::compose_gradient<R>(answers, v_mean.data(), v_quat.data(), v_size.data(), v_canonical.data(), v_moved.data(), 2);
-    graings::gather_gradient<R>({anchors, slots, place.data(), log_scale.data(), offset.data()}, drawn, numbers.data(), row.data(), v_mean.data(), v_size.data(), v_log_scale.data(), v_offset.data(), 2);
-    write("v_canonical", v_canonical), write("v_moved", v_moved), write("v_log_scale", v_log_scale), write("v_offset", v_offset);
+    std::vector<R> v_canonical(7 * drawn), v_deformation(10 * drawn), v_log_scale(3 * anchors), v_offset(3 * drawn);
+    graings::compose_gradient<R>(outputs, v_mean.data(), v_quat.data(), v_size.data(), v_canonical.data(), v_deformation.data(), 2);
+    graings::gather_gradient<R>({anchors, slots, position.data(), log_scale.data(), offset.data()}, drawn, numbers.data(), row.data(), v_mean.data(), v_size.data(), v_log_scale.data(), v_offset.data(), 2);
+    write("v_canonical", v_canonical), write("v_deformation", v_deformation), write("v_log_scale", v_log_scale), write("v_offset", v_offset);
 }
 
 }  // namespace
 
 int main() {
-    pictures<float>(), networks<float>(), children<float>();
-    pictures<double>(), networks<double>(), children<double>();
+    images<float>(), networks<float>(), children<float>();
+    images<double>(), networks<double>(), children<double>();
 }

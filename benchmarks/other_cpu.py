@@ -1,15 +1,15 @@
-"""Runs the kernel on a CPU that is not here, and says how far its numbers are from those of this one.
+"""Runs the kernel on an emulated CPU and compares its results with those of this CPU.
 
     python benchmarks/other_cpu.py [--compiler aarch64-linux-gnu-g++] [--emulator qemu-aarch64]
 
 Compiles the kernel's sources with other_cpu.cpp, which needs no interpreter, once for this CPU and once with
-`compiler`, and runs the second by `emulator` (Debian: g++-aarch64-linux-gnu, qemu-user). The same integers make the
-same inputs on both. Prints for every array the largest difference to this CPU's float64, as a share of the array's
-largest number: of the other CPU, and of each instruction set here. The exit code is 1 where the other CPU is off by
-more than ten times what the worst instruction set here is, and in float64 by more than 1e-12 as well: sums whose
-products are not fused differ by 4e-14 there.
+`compiler`, and runs the latter with `emulator` (Debian: g++-aarch64-linux-gnu, qemu-user). Inputs are
+generated from the same integers on both. Prints for every array the largest difference from this CPU's float64 results,
+relative to the array's largest number, for the other CPU and for each instruction set here. The exit code is 1 if the
+other CPU differs by more than ten times the worst instruction set here, and in float64 also by more than 1e-12: sums
+without fused products differ by 4e-14.
 
-Says nothing of speed: emulation has none.
+It does not measure speed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Arrays = dict[str, NDArray[np.float64]]
 
 
 def build(compiler: str, folder: Path) -> Path:
-    """The program for the CPU that `compiler` knows, with all instruction sets of it that the kernel has."""
+    """The program for the compiler's CPU, with all of the kernel's instruction sets for it."""
     machine = subprocess.run([compiler, "-dumpmachine"], capture_output=True, text=True, check=True).stdout
     sets: dict[str, list[str]] = {"generic": []}
     if machine.startswith("x86_64"):
@@ -67,7 +67,7 @@ def build(compiler: str, folder: Path) -> Path:
 
 
 def output(*command: str, isa: str) -> Arrays:
-    """What the program wrote, run with the instruction set `isa`."""
+    """The arrays written by the program, run with the instruction set `isa`."""
     written = subprocess.run(command, env=os.environ | {"GRAINGS_ISA": isa}, capture_output=True, check=True).stdout
     arrays: Arrays = {}
     while written:
@@ -79,7 +79,7 @@ def output(*command: str, isa: str) -> Arrays:
 
 
 def distance(array: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
-    """The largest difference as a share of the largest number; infinite where either is not finite."""
+    """The largest difference relative to the largest number; infinite if it is not finite."""
     apart = float(np.abs(array - truth).max() / np.abs(truth).max())
     return apart if np.isfinite(apart) else float("inf")
 

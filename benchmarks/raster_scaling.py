@@ -1,9 +1,9 @@
-"""How the rasterizer's time grows: against Gaussians, against pixels, against threads, stage by stage.
+"""How the rasterizer's time scales with Gaussians, pixels and threads, by stage.
 
     python benchmarks/raster_scaling.py --yardstick DIR -o FOLDER [--rounds 11]
 
 DIR holds `bench_scene.py` (see rasterize.py). Writes FOLDER/raster_scaling.{json,svg} and prints, for every stage, the
-slope of log time against log size: 1 is linear, 0 does not grow. Medians of wall-clock milliseconds of one forward +
+slope of log time against log size: 1 is linear, 0 is constant. Medians of wall-clock milliseconds of one forward +
 backward.
 """
 

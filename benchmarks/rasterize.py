@@ -1,22 +1,22 @@
-"""Times the rasterizer against a yardstick, forward and forward + backward.
+"""Times the rasterizer and a reference implementation ("yardstick"), forward and forward + backward.
 
     python benchmarks/rasterize.py --yardstick DIR [--gaussians 10000 50000 200000] [--splat FILE] [--run RUN]
                                    [--size 400 800] [--threads 1 2] [--rounds 8] [--json FILE] [--oracle]
 
 DIR holds `bench_scene.py` with `make_scene(n)`, `camera(size, dist=...)` and `target_image(height, width)`, and
 optionally `limit_kernel.py` with a class `LimitKernel(scene, camera)` that has `forward()` and `fwd_bwd(target)`: the
-yardstick, built when first used. Further scenes: splat files and run folders of trained models. Ours goes through the
-PyTorch function with its argument checks and gives colour and alpha, and depth where a row says so; both take the sign
-of the difference to the target as upstream.
+yardstick, built when first used. Further scenes: splat files and run folders of trained models. Our time includes the
+PyTorch function with its argument checks; it computes colour and alpha, and depth in the rows that name it. Both use
+the sign of the difference to the target as upstream gradient.
 
-The two are timed in turn, so that a busy neighbour hits both: a pause, a call to warm up, three that count. The
-yardstick runs in a process of its own, because both would otherwise share the threads of one OpenMP library, which
-keep a core busy long after a call.
+The two are timed alternately, so that other load affects both: a pause, a warm-up call, three measured calls. The
+yardstick runs in its own process, because both would otherwise share the threads of one OpenMP library, which keep a
+core busy long after a call.
 
 Prints median (minimum) in ms, the ratio of the medians, and the memory that one forward + backward takes at its peak
-beyond its inputs: images and gradients count, and nothing freed before is at hand.
-`backward_given` is forward + backward for an upstream made beforehand: what threads can share, and what memory is
-measured with.
+beyond its inputs, images and gradients included, in a fresh process.
+`backward_given` is forward + backward with a precomputed upstream gradient: only work that threads share; memory is
+measured with it.
 `--oracle` adds the plain torch oracle (slow).
 """
 
@@ -45,13 +45,13 @@ from graings.raster.photometric import photometric
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RenderResult
 
-PAUSE = 0.04  # s; a yardstick's threads look about for 10 ms after a call
+PAUSE = 0.04  # s; OpenMP threads spin for about 10 ms after a call
 REPEATS = 3
 Milliseconds = Callable[[], float]
 
 
 class Ours:
-    """One scene drawn by a rasterizer of ours."""
+    """One scene drawn by one of our rasterizers."""
 
     def __init__(self, scene: scenes.Scene, draw: Callable[..., RenderResult] = rasterize) -> None:
         arrays, view = scene.arrays, scene.view
@@ -106,7 +106,7 @@ class Ours:
 
 
 class Yardstick:
-    """The yardstick on one scene, in a process of its own."""
+    """The yardstick on one scene, in its own process."""
 
     def __init__(self, folder: Path, name: str, threads: int) -> None:
         command = [sys.executable, __file__, "--yardstick", str(folder), "--serve", name, str(threads)]
@@ -114,7 +114,7 @@ class Yardstick:
         self.ask("forward")
 
     def ask(self, name: str) -> float:
-        """Milliseconds of one call there."""
+        """Milliseconds of one call in that process."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write(name + "\n")
@@ -134,7 +134,7 @@ class Yardstick:
 
 
 def serve(folder: Path, name: str, threads: int) -> None:
-    """What `Yardstick` asks of its process."""
+    """The server loop in the process of `Yardstick`."""
     limit = scenes.module_of(folder, "limit_kernel")
     assert limit is not None
     limit.L.omp_set_num_threads(threads)
@@ -148,7 +148,7 @@ def serve(folder: Path, name: str, threads: int) -> None:
 
 
 def in_turn(rounds: int, calls: dict[str, Milliseconds]) -> dict[str, list[float]]:
-    """Milliseconds of each, the first round of all left out."""
+    """Milliseconds of each call, without the first round."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(rounds + 1):
         for name, call in calls.items():
@@ -160,19 +160,19 @@ def in_turn(rounds: int, calls: dict[str, Milliseconds]) -> dict[str, list[float
 
 
 def peak_mb(folder: Path, name: str) -> float:
-    """Resident memory that one forward + backward needs at its peak beyond its inputs, in a process of its own."""
+    """Peak resident memory of one forward + backward beyond its inputs, in MB, measured in its own process."""
     command = [sys.executable, __file__, "--yardstick", str(folder), "--measure-memory", name]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
 def measure_memory(folder: Path, name: str) -> float:
-    """What `peak_mb` asks of its process."""
+    """The measurement in the process of `peak_mb`."""
     scene = scenes.named(name, folder)
     ours = Ours(scene)
     del ours.image
-    Ours(scenes.named("100/16", folder)).forward_backward()  # libraries come in
+    Ours(scenes.named("100/16", folder)).forward_backward()  # loads the libraries
     if hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
-        libc.malloc_trim(0)  # what was freed would hide what is asked for
+        libc.malloc_trim(0)  # freed memory could be reused without being counted
     before = _status_kb("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
     ours.backward_given()
@@ -185,7 +185,7 @@ def _status_kb(field: str) -> int:
 
 
 def measured(name: str, threads: int, options: argparse.Namespace) -> list[dict[str, object]]:
-    """One row per pass, printed as they come."""
+    """One row per pass; each is printed when it is complete."""
     scene = scenes.named(name, options.yardstick)
     use_threads(threads)
     ours = Ours(scene)

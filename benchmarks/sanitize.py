@@ -1,13 +1,13 @@
-"""Runs the rasterizer's tests on a kernel built with a sanitizer, and prints what it found.
+"""Runs the rasterizer's tests on a kernel built with a sanitizer, and prints its findings.
 
     python benchmarks/sanitize.py address | undefined | thread [pytest's arguments]
 
 Works in a copy of the package in a temporary folder. Without further arguments `address` and `undefined` run
-tests/raster, `thread` those tests of it in which threads meet. The exit code is 1 where a test fails or the sanitizer
-finds something.
+tests/raster, `thread` those of its tests that use several threads. The exit code is 1 if a test fails or the sanitizer
+reports a finding.
 
-A few tests cannot pass under `address`: those that have glibc fill memory with 0xFF, as the sanitizer brings an
-allocator of its own, and one of peak memory, which the sanitizer's bookkeeping exceeds. Needs GCC, CMake and nanobind.
+A few tests cannot pass under `address`: those in which glibc fills memory with 0xFF, because the sanitizer has its own
+allocator, and one of peak memory, which the sanitizer's bookkeeping exceeds. Needs GCC, CMake and nanobind.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TESTS = {
 
 
 def preloaded(kind: str) -> str:
-    """What has to be loaded before the interpreter: the sanitizer, and libstdc++, whose exceptions it intercepts."""
+    """Libraries to preload: the sanitizer, and libstdc++, whose exceptions it intercepts."""
     paths = []
     for name in (LIBRARIES[kind], "libstdc++.so.6"):
         found = subprocess.run(["g++", f"-print-file-name={name}"], capture_output=True, text=True, check=True)
@@ -40,14 +40,14 @@ def preloaded(kind: str) -> str:
 
 
 def environment(kind: str, findings: Path) -> dict[str, str]:
-    """Variables for the tests: findings go to files named `findings`.PID, as pytest keeps what is written elsewhere."""
+    """Environment of the tests: findings go to files named `findings`.PID, because pytest captures other output."""
     settings = {
-        "address": "detect_leaks=0",  # an interpreter leaves much to the system when it ends
+        "address": "detect_leaks=0",  # the interpreter does not free all memory at exit
         "undefined": "print_stacktrace=1:halt_on_error=1",
         "thread": "halt_on_error=1:ignore_noninstrumented_modules=1",
     }
     name = {"address": "ASAN_OPTIONS", "undefined": "UBSAN_OPTIONS", "thread": "TSAN_OPTIONS"}[kind]
-    # OpenMP of torch is not built with the sanitizer: what its threads do would be told as races.
+    # OpenMP of torch is not built with the sanitizer, which would report its threads as races.
     return {name: f"{settings[kind]}:log_path={findings}", "LD_PRELOAD": preloaded(kind), "OMP_NUM_THREADS": "1"}
 
 

@@ -1,11 +1,11 @@
-"""How a training step's time grows: against Gaussians at one image size, against pixels at one scene.
+"""How the time of a training step scales with Gaussians and with pixels.
 
     python benchmarks/step_scaling.py RUN -o FOLDER [--threads 2] [--steps 40]
 
 Continues RUN (a folder with a checkpoint) in memory; nothing in it is written. Fewer Gaussians are a random share of
-its anchors, other sizes the same capture read anew, so the largest useful size is that of its files. Writes
+its anchors, other sizes the same capture loaded again, so the largest useful size is that of its files. Writes
 FOLDER/step_scaling.{json,svg} and prints median milliseconds and the slope of log time against log size: 1 is linear, 0
-does not grow. A step has as many views as the run says. The parts are those of training_step.py.
+is constant. A step has the batch of the run. The parts are those of training_step.py.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def trainer_of(options: argparse.Namespace, share: float, side: int | None) -> T
     """A trainer of the run with that share of its anchors, on images of that size (None: the run's own)."""
     run = TrainingRun.resume(options.run, threads=options.threads)
     trainer: Trainer = run._trainer
-    # Where nothing grows or goes any more.
+    # A phase without growth and pruning.
     trainer.iteration = min(trainer.iteration, run.iterations - options.steps - 10)
     if side is not None:
         trainer.capture = load_capture(run.capture.root, run.config.capture.model_copy(update={"max_side": side}))
@@ -52,7 +52,7 @@ def trainer_of(options: argparse.Namespace, share: float, side: int | None) -> T
         keep = torch.rand(count, generator=torch.Generator().manual_seed(0)) < share
         trainer.optimizer.keep(keep)
         trainer.density.statistics.resize(keep=keep)
-        trainer.average = ParameterAverage()  # that of the checkpoint is of all anchors
+        trainer.average = ParameterAverage()  # that of the checkpoint covers all anchors
     return trainer
 
 

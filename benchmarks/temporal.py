@@ -1,14 +1,14 @@
-"""How a model behaves in time: flicker where nothing moves, and error between the times it was trained on.
+"""A model over time: flicker where nothing moves, and error between training times.
 
     python benchmarks/temporal.py RUN... -o FOLDER [--frames 100] [--view 0]
 
-Flicker: one held-out camera stands still while time runs through [0, 1]. A pixel rests where the figure covers it at
-every time and the mean over five frames around each stays within 4 levels of 255; what the frames differ from that mean
-is flicker, as RMS and largest deviation in levels. There is no truth for one camera at all times, so this measures
-steadiness and not error.
+Flicker: one held-out camera is fixed while time runs through [0, 1]. A pixel is at rest if the object covers it at
+every time and the moving average over five frames varies by at most 4 levels of 255. Flicker is the deviation of the
+frames from that average, as RMS and maximum in levels. No ground truth exists for one camera at all times, so this
+measures steadiness and not error.
 
-Between frames: PSNR of training views and of held-out views by how far the nearest training time is, in steps of the
-training spacing; 0 is a held-out view at a training time (to a hundredth of a step).
+Error between frames: PSNR of training views, and of held-out views by their distance from the nearest training time in
+steps of the training spacing; 0 is a held-out view at a training time (to a hundredth of a step).
 
 Prints a row for each run and writes FOLDER/temporal.json and, for each run, FOLDER/NAME.png: 24 frames of the clip.
 """
@@ -41,13 +41,13 @@ SHOWN = (4, 6)
 def clip(model: Model, view: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
     """(colors [T, H, W, 3] in [0, 1], alphas [T, H, W]) of one held-out camera at `frames` times over [0, 1]."""
     camera = model.views["val"][view].camera
-    pictures = [render(model.scene, camera, float(t), model.background) for t in np.linspace(0, 1, frames)]
-    colors = np.stack([picture.color.clamp(0, 1).numpy() for picture in pictures])
-    return colors, np.stack([picture.alpha.numpy().reshape(colors.shape[1:3]) for picture in pictures])
+    results = [render(model.scene, camera, float(t), model.background) for t in np.linspace(0, 1, frames)]
+    colors = np.stack([result.color.clamp(0, 1).numpy() for result in results])
+    return colors, np.stack([result.alpha.numpy().reshape(colors.shape[1:3]) for result in results])
 
 
 def flicker(colors: np.ndarray, alphas: np.ndarray) -> dict[str, float | None]:
-    """Share of covered pixels at rest, and in levels of 255 the RMS and largest deviation there from the slow part."""
+    """Share of covered pixels at rest, and their RMS and largest deviation from the moving average in levels of 255."""
     half = WINDOW // 2
     sums = np.cumsum(np.concatenate([np.zeros_like(colors[:1]), colors], dtype=np.float64), axis=0)
     slow = (sums[WINDOW:] - sums[:-WINDOW]) / WINDOW
@@ -93,7 +93,7 @@ def main() -> None:
     options = parser.parse_args()
 
     if len({run.name for run in options.runs}) < len(options.runs):
-        parser.error("two of the runs have the same folder name, which names their row and picture: rename one")
+        parser.error("two of the runs have the same folder name, which names their row and image: rename one")
     models = {run: load_model(run) for run in options.runs}
     for run, model in models.items():
         if options.view not in range(len(model.views["val"])):

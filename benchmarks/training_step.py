@@ -1,10 +1,9 @@
-"""Where one training step goes: milliseconds per part, on a run folder that has a checkpoint.
+"""Time of the parts of a training step, on a run folder that has a checkpoint.
 
     python benchmarks/training_step.py RUN [--steps 50] [--threads 2] [--batch 1]
 
-Continues the run in memory (nothing is written) and measures each part of a step apart: drawing, its loss and its way
-back view by view, where a real step draws all views first. The last line compares the sum with the unbroken
-`Trainer.step`.
+Continues the run in memory (nothing is written) and measures each part of a step separately. Drawing, loss and backward
+pass run view by view, whereas a real step draws all views first. The last line is the time of `Trainer.step` itself.
 """
 
 from __future__ import annotations
@@ -42,14 +41,14 @@ class Stopwatch:
         self._last = now
 
     def close(self) -> None:
-        """The step has ended."""
+        """Ends a step."""
         for name, milliseconds in self._step.items():
             self.parts[name].append(milliseconds)
         self._step.clear()
 
 
 def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
-    """One step taken apart; returns the number of Gaussians drawn."""
+    """One step, part by part; returns the number of Gaussians drawn."""
     trainer.iteration += 1
     trainer.scene.temporal = trainer.phase(trainer.iteration).temporal
     frames = trainer.views.next(trainer.iteration)
@@ -71,10 +70,10 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
         (photometric(image, target, trainer.config.loss.ssim) / len(frames)).backward()
         watch.lap("photometric loss, forward + backward")
         own = [gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.opacities, gaussians.colors]
-        *gradients, at_centres = torch.autograd.grad(result.color, [*own, offset], image.grad)
+        *raster_gradients, at_centres = torch.autograd.grad(result.color, [*own, offset], image.grad)
         watch.lap("raster backward")
         leaves += own
-        grads += gradients
+        grads += raster_gradients
         screen.append((at_centres, result.radii.amax(-1) > 0))
     regulariser = trainer.objective.regularisers(trainer.scene, compositions, [frame.time for frame in frames])
     watch.lap("regularisers forward (a second time of DeformNet)")
@@ -83,9 +82,9 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
         [*grads, *([torch.ones(())] if regulariser.requires_grad else [])],
     )
     watch.lap("scene backward")
-    judged = trainer.optimizer.gradients()
-    judged += [Gradient("the projected centres", "screen", at_centres) for at_centres, _ in screen]
-    trainer.guard.judge(trainer.iteration, regulariser.detach(), judged)
+    gradients = trainer.optimizer.gradients()
+    gradients += [Gradient("the projected centres", "screen", at_centres) for at_centres, _ in screen]
+    trainer.guard.check_step(trainer.iteration, regulariser.detach(), gradients)
     watch.lap("guard")
     for frame, composition, (at_centres, visible) in zip(frames, compositions, screen, strict=True):
         size = (frame.camera.width, frame.camera.height)
@@ -132,7 +131,7 @@ def main() -> None:
         total += median
         print(f"{median:8.2f} ms  {name}")
     print(f"{total:8.2f} ms  sum of the parts")
-    print(f"{statistics.median(whole):8.2f} ms  Trainer.step, unbroken")
+    print(f"{statistics.median(whole):8.2f} ms  Trainer.step")
 
 
 if __name__ == "__main__":

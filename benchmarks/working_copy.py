@@ -1,7 +1,4 @@
-"""WorkingCopy: the package in a folder of its own, where it may be changed, built otherwise and tested.
-
-Knows nothing of mutants or sanitizers.
-"""
+"""WorkingCopy: a copy of the package that may be changed, built with other options and tested."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from pathlib import Path
 
 COPIED = ("graings", "tests", "CMakeLists.txt", "pyproject.toml")
 
-# An installed package may be found by an import finder of its own, before the working folder: without it.
+# An editable installation adds an import finder that would take precedence over the copy; it is removed.
 RUN_PYTEST = """
 import sys
 sys.meta_path = [finder for finder in sys.meta_path if "ScikitBuild" not in type(finder).__name__]
@@ -43,13 +40,13 @@ class WorkingCopy:
         self._run("cmake", "-S", ".", "-B", "build", "-DCMAKE_BUILD_TYPE=Release", python, *options)
 
     def build(self) -> None:
-        """Build the kernel. Raises `SystemExit` where that fails."""
+        """Build the kernel. Raises `SystemExit` if that fails."""
         self._run("cmake", "--build", "build", "--target", "_kernel", "--parallel", str(self.jobs))
         for module in (self.folder / "build").glob("_kernel*.so"):
             shutil.copy2(module, self.folder / "graings/kernel")
 
     def pytest(self, *arguments: str, environment: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
-        """Run tests of the copy with these variables besides those there are; what came of it."""
+        """Run tests of the copy with additional environment variables; returns the finished process."""
         return subprocess.run(
             [sys.executable, "-c", RUN_PYTEST, str(self.folder), "-p", "no:cacheprovider", *arguments],
             cwd=self.folder,

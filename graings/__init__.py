@@ -1,3 +1,3 @@
-"""GrainGS: see a moving scene from anywhere, at any time, with nothing but a CPU."""
+"""GrainGS: dynamic 3D Gaussian splatting on a CPU."""
 
 __version__ = "0.1.0"

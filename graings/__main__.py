@@ -1,4 +1,4 @@
-"""`python -m graings`: the same as the command `graings`."""
+"""`python -m graings`: equivalent to the command `graings`."""
 
 from graings.cli.main import main
 

@@ -1,14 +1,13 @@
-"""What can go wrong with the outside world.
+"""Errors caused by files, options, the machine or the optimisation; not by misuse of a function.
 
     GraingsError
     ├── CaptureError      a file of the capture is missing, broken or contradicts another
     ├── ConfigError       an option is unknown or out of range
     ├── CheckpointError   a run folder or checkpoint cannot be read or written
     ├── KernelError       the compiled kernel is absent or cannot run on this CPU
-    └── DivergedError     training cannot continue; the best checkpoint is kept
+    └── DivergedError     training cannot continue; the best model is kept as the newest checkpoint
 
-Each message names the file or field and what to do about it. Misuse by a caller is a plain
-`ValueError` where it happens. Knows nothing of HTTP statuses or exit codes.
+Each message names the file or field and a remedy. Misuse by a caller raises a plain `ValueError`.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from pathlib import Path
 
 
 class GraingsError(Exception):
-    """Root of every error a user can meet."""
+    """Base class of all errors a user can encounter."""
 
 
 class CaptureError(GraingsError):
     """A capture cannot be used as it is.
 
-    `file` is the offending file (relative to the capture where possible), `field` the key or image
-    property in it, `remedy` what the user can do.
+    `file` is the file concerned (relative to the capture where possible), `field` the key or image property in it,
+    `remedy` what the user can do.
     """
 
     def __init__(self, problem: str, *, file: Path | str, field: str | None = None, remedy: str) -> None:

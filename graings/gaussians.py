@@ -1,7 +1,4 @@
-"""Gaussians: what is drawn at one instant.
-
-A plain batch. Knows nothing of anchors, networks, time or cameras.
-"""
+"""Gaussians: the batch that the rasterizer draws, at one instant."""
 
 from __future__ import annotations
 
@@ -16,8 +13,8 @@ from torch import Tensor
 class Gaussians:
     """N anisotropic Gaussians, one row each; all floating tensors share dtype (float32 or float64).
 
-    `uids` are persistent birth numbers: they break ties of depth, so that the picture does not depend on
-    the order of rows.
+    `uids` are persistent numbers that break ties of depth, so that the image does not depend on the order of rows.
+    Raises `ValueError` for a wrong shape or dtype.
     """
 
     means: Float[Tensor, "gaussian 3"]  # centres, normalised world units

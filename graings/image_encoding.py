@@ -1,8 +1,6 @@
-"""Encode: an image as the bytes of a file.
+"""Image encoding: an image array as the bytes of a file.
 
-Four formats, by name: `png`, `jpeg` and `webp` hold 8 bits per channel, `exr` half floats without any rounding
-to grey levels. Values pass as they are; no transfer function is applied. Knows nothing of scenes or HTTP
-beyond the name of a media type.
+`png`, `jpeg` and `webp` have 8 bits per channel, `exr` half floats. No transfer function is applied.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ MEDIA_TYPES: Final[dict[ImageFormat, str]] = {
     "webp": "image/webp",
     "exr": "image/x-exr",
 }
-# OpenImageIO's default for WebP, quality 100, takes seconds for a noisy picture that 80 writes in milliseconds.
+# OpenImageIO's default quality for WebP, 100, takes seconds for a noisy image; 80 takes milliseconds.
 QUALITIES: Final[dict[ImageFormat, int]] = {"jpeg": 92, "webp": 80}
 
 # Deflate at its lowest level: twice as fast as the default for a few per cent more bytes.
@@ -32,7 +30,10 @@ PNG_LEVEL: Final = 1
 
 
 def image_format(name: str) -> ImageFormat:
-    """The format called `name`: `png`, a suffix like `.jpg` or a media type like `image/webp`."""
+    """The format of a name like `png`, a suffix like `.jpg` or a media type like `image/webp`.
+
+    Raises `ValueError` naming the supported formats.
+    """
     plain = name.strip().lower().removeprefix(".")
     plain = {"jpg": "jpeg", "image/jpg": "jpeg", "image/exr": "exr"}.get(plain, plain)
     for known in FORMATS:
@@ -42,10 +43,10 @@ def image_format(name: str) -> ImageFormat:
 
 
 def encode_image(color: ArrayLike, format: ImageFormat = "png", *, quality: int | None = None) -> bytes:
-    """The file of `color` [H, W, 3] in [0, 1]; values outside are clipped, except in `exr`.
+    """The file contents for `color` [H, W, 3] in [0, 1]; values outside are clipped, except in `exr`.
 
-    `quality` (1 to 100) is for `jpeg` and `webp`. Raises `ValueError` for anything else, and for an image that
-    is not finite.
+    `quality` (1 to 100) applies to `jpeg` and `webp`. Raises `ValueError` for a wrong shape, a non-finite image, an
+    unknown format, or a quality out of range or for another format.
     """
     image = np.asarray(color, dtype=np.float32)
     if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:

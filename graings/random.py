@@ -1,7 +1,4 @@
-"""Seeds by name, so that leaving one part out does not change the numbers of another.
-
-Knows nothing of what the numbers are used for.
-"""
+"""Named random streams: each user of random numbers has its own, so that leaving one out does not change the others."""
 
 from __future__ import annotations
 
@@ -14,21 +11,21 @@ from torch import Tensor
 
 
 def stream_seed(seed: int, name: str) -> int:
-    """The seed of the part `name` in a run of `seed`; 63 bits."""
+    """The 63-bit seed of the stream `name` in a run with `seed`."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
 
 
 @contextmanager
 def torch_stream(seed: int, name: str) -> Iterator[None]:
-    """Torch's global stream, from which modules draw their weights, is that of `name` inside and as before after."""
+    """Seeds torch's global generator, which initialises modules, with the stream `name`; restores it afterwards."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(stream_seed(seed, name))
         yield
 
 
 class RandomStreams:
-    """Generators by name, created on first use and saved whole."""
+    """Generators by name, created on first use, whose states are saved and restored together."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -46,6 +43,6 @@ class RandomStreams:
         return {name: generator.get_state() for name, generator in sorted(self._generators.items())}
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Continue where `state` was taken."""
+        """Restore the generators to `state`."""
         for name, tensor in state.items():
             self[name].set_state(tensor)

@@ -1,7 +1,6 @@
-"""render: the one path from a scene to a picture.
+"""render: the one path from a scene to an image.
 
-Training, evaluation and serving all pass here; scene and rasterizer meet nowhere else. Knows
-nothing of images on disk, losses or HTTP.
+Training, evaluation and serving all use it; scene and rasterizer meet nowhere else.
 """
 
 from __future__ import annotations
@@ -20,7 +19,8 @@ from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from graings.scene.scene import Composition, Scene
 
-MOST_PIXELS: Final = 1 << 23  # drawn for a picture that asks for fewer: four for each of 1920 x 1080, in 200 MB
+# Upper bound of the supersampled image: four pixels for each of 1920 x 1080, in 200 MB.
+MAX_SUPERSAMPLED_PIXELS: Final = 1 << 23
 
 
 def render(
@@ -33,21 +33,21 @@ def render(
 ) -> RenderResult:
     """The scene at `time` in [0, 1] from `camera` on a `background` RGB in [0, 1], without gradients."""
     with torch.inference_mode():
-        return picture(scene.compose(camera.center, time), camera, background, settings=settings)
+        return render_composition(scene.compose(camera.center, time), camera, background, settings=settings)
 
 
-def picture(
+def render_composition(
     composition: Composition,
     camera: Camera,
     background: Sequence[float],
     *,
     settings: RasterSettings | None = None,
 ) -> RenderResult:
-    """As `draw`, without gradients, for any size and distance: pixels coarser than training's are means of finer ones.
+    """As `draw`, without gradients and antialiased: a view coarser than the training views is supersampled.
 
-    A rasterizer looks at the middles of pixels only, and what the model knows lies between them: drawn at once, a
-    picture of half the size is 2 to 7 dB worse, and one of a quarter 8 to 17 (docs/experiments/). The networks take
-    most of a picture's time, so that the finer pixels hardly cost any.
+    The rasterizer samples only the centre of each pixel. Without supersampling an image of half the training size is 2
+    to 7 dB worse, and one of a quarter 8 to 17 dB (docs/experiments/). Most of the time of an image goes to the
+    networks, so the additional pixels cost little.
     """
     parts = supersampling(composition, camera)
     with torch.no_grad():
@@ -57,21 +57,21 @@ def picture(
         fine = draw(composition, camera.resized(parts * width, parts * height), background, settings=settings)
         return replace(
             fine,
-            color=_averaged(fine.color, parts),
-            alpha=_averaged(fine.alpha, parts),
+            color=_box_average(fine.color, parts),
+            alpha=_box_average(fine.alpha, parts),
             means2d=fine.means2d / parts,
             radii=fine.radii / parts,
         )
 
 
 def supersampling(composition: Composition, camera: Camera) -> int:
-    """Into how many parts, along each side, a pixel of `camera` has to be divided to be as fine as in training."""
-    bearable = max(1, math.isqrt(MOST_PIXELS // (camera.width * camera.height)))
-    return max(1, math.ceil(min(composition.sampling.undersampling(camera), bearable)))
+    """Samples per pixel along each axis that make `camera` sample the scene as finely as the training views did."""
+    limit = max(1, math.isqrt(MAX_SUPERSAMPLED_PIXELS // (camera.width * camera.height)))
+    return max(1, math.ceil(min(composition.sampling.undersampling(camera), limit)))
 
 
-def _averaged(fine: Float[Tensor, "fine_height fine_width *channel"], parts: int) -> Tensor:
-    """Means of `parts` x `parts` pixels; one axis after the other, which torch does several times faster."""
+def _box_average(fine: Float[Tensor, "fine_height fine_width *channel"], parts: int) -> Tensor:
+    """Means of `parts` x `parts` pixels; one axis after the other, which is several times faster in torch."""
     height, width = fine.shape[0] // parts, fine.shape[1] // parts
     rows = fine.view(height, parts, -1).sum(1).view(height, width, parts, *fine.shape[2:])
     total: Tensor = sum(rows.unbind(2), start=torch.zeros((), dtype=rows.dtype))
@@ -88,7 +88,7 @@ def draw(
 ) -> RenderResult:
     """Rasterize a composition, without depth; gradients flow to it and to `means2d_offset` (pixels).
 
-    The low-pass is always that of the composition, in this camera's pixels.
+    The low-pass filter is that of the composition for this camera (`low_pass`); `settings.blur` is not used.
     """
     gaussians = composition.gaussians
     return rasterize(
@@ -102,11 +102,11 @@ def draw(
 
 
 def low_pass(composition: Composition, camera: Camera) -> float:
-    """Variance in px^2 that `camera` adds to both axes of a footprint: as wide on the scene in every picture.
+    """Variance in px^2 of the low-pass filter for `camera`: a constant width in the scene, not in pixels.
 
-    The composition's own where the camera looks as finely as training's reference. With as much in the pixels of every
-    camera, a picture of twice the size shows the gaps that training had closed, and far views of training widen what
-    near ones want narrow: 1 to 8 dB (docs/experiments/).
+    It equals the composition's own `blur` at the reference sampling rate of the training views. A constant width in
+    pixels loses 1 to 8 dB (docs/experiments/): an image of twice the size shows gaps between Gaussians, and distant
+    training views widen Gaussians that near views need narrow.
     """
     relative_rate = composition.sampling.relative_rate(camera)
     return composition.blur * relative_rate * relative_rate  # a power would raise where this is infinite

@@ -12,7 +12,7 @@ from graings.scene.scene import Scene
 EYE = (0.0, -2.0, 0.5)
 
 
-SAMPLING = SamplingRate(extent=1.0, reference=10.0, coarsest=10.0)  # of small test cameras, about
+SAMPLING = SamplingRate(extent=1.0, reference=10.0, coarsest=10.0)  # about that of small test cameras
 
 
 def tiny_scene(

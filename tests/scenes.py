@@ -1,4 +1,4 @@
-"""Tiny Gaussian scenes, ordinary and extreme, all made from a seed.
+"""Small Gaussian scenes, ordinary and extreme, generated from a seed.
 
 Every builder returns float64 Gaussians and a camera that looks at them.
 """

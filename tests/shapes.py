@@ -1,4 +1,4 @@
-"""The type checker behind the shape annotations: beartype, which cannot judge numpy's ArrayLike."""
+"""The type checker of the shape annotations: beartype, except for numpy's ArrayLike, which it does not support."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_an_unknown_format_is_refused_with_the_known_ones() -> None:
         encode_image(gradient(), "gif")  # type: ignore[arg-type]
 
 
-def test_what_is_no_image_is_refused() -> None:
+def test_invalid_images_and_qualities_are_refused() -> None:
     with pytest.raises(ValueError, match="shape"):
         encode_image(np.zeros((4, 4)))
     with pytest.raises(ValueError, match="finite"):

@@ -1,4 +1,4 @@
-"""The one path from a scene to a picture."""
+"""From a scene to an image: the low-pass filter and supersampling."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from graings.camera.camera import Camera
 from graings.camera.sampling_rate import SamplingRate
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
-from graings.render import MOST_PIXELS, draw, low_pass, picture, render, supersampling
+from graings.render import MAX_SUPERSAMPLED_PIXELS, draw, low_pass, render, render_composition, supersampling
 from graings.scene.scene import Scene
 from tests.capture.captures import orbit
 from tests.models import tiny_scene
@@ -22,16 +22,14 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 def trained_on(scene: Scene, size: tuple[int, int]) -> Scene:
-    """`scene` as if its training views had this size."""
+    """`scene`, with the sampling rate of training views of this size."""
     scene.sampling = SamplingRate.of([orbit(i, 3, size) for i in range(3)], float(scene.extent))
     return scene
 
 
 @pytest.mark.parametrize("settings", [None, RasterSettings(blur=7.0, transmittance_min=0.0)])
 @pytest.mark.parametrize("share", [0.5, 1.0, 3.0])
-def test_a_picture_has_the_low_pass_of_its_scene_in_its_own_pixels(
-    settings: RasterSettings | None, share: float
-) -> None:
+def test_an_image_uses_the_low_pass_of_its_composition(settings: RasterSettings | None, share: float) -> None:
     scene = trained_on(tiny_scene(anchors=40), (32, 32))
     camera = orbit(0, 3, (32, 32)).resized(int(32 * share), int(32 * share))
     composition = scene.compose(camera.center, 0.5)
@@ -41,21 +39,21 @@ def test_a_picture_has_the_low_pass_of_its_scene_in_its_own_pixels(
         asked = replace(settings or RasterSettings(), blur=low_pass(composition, camera))
         expected = rasterize(composition.gaussians, camera, torch.tensor(WHITE), settings=asked).color
         assert torch.equal(draw(composition, camera, WHITE, settings=settings).color, expected)
-        if share >= 1:  # smaller ones are drawn finer
-            assert torch.equal(picture(composition, camera, WHITE, settings=settings).color, expected)
+        if share >= 1:  # smaller images are supersampled
+            assert torch.equal(render_composition(composition, camera, WHITE, settings=settings).color, expected)
             assert torch.equal(render(scene, camera, 0.5, WHITE, settings=settings).color, expected)
         other = draw(replace(composition, blur=2.0), camera, WHITE, settings=settings).color
         assert not torch.equal(other, expected)
 
 
-def test_a_camera_of_training_has_the_low_pass_to_the_bit() -> None:
+def test_a_training_camera_has_the_configured_low_pass_to_the_bit() -> None:
     scene = trained_on(tiny_scene(anchors=4), (32, 32))
     camera = orbit(1, 3, (32, 32))
     assert low_pass(scene.compose(camera.center, 0.5), camera) == scene.config.blur
 
 
-def test_the_low_pass_is_as_wide_on_the_scene_from_everywhere() -> None:
-    """Training views of other distances count as any other picture; a camera amid the content is at its rim."""
+def test_the_low_pass_has_a_constant_width_in_the_scene() -> None:
+    """It depends on the camera's sampling rate alone; inside the scene the distance counts as the scene's extent."""
     scene = tiny_scene(anchors=4)
     near, far = (orbit(i, 3, (32, 32), distance) for i, distance in enumerate((2.0, 5.0)))
     scene.sampling = SamplingRate.of([near, far, near], float(scene.extent))
@@ -75,8 +73,8 @@ def test_the_low_pass_is_as_wide_on_the_scene_from_everywhere() -> None:
     assert drawn(orbit(0, 3, (64, 64), 2.0)) == (pytest.approx((2 / 1.05) ** 2), 1)
 
 
-def test_what_training_drew_a_little_coarser_is_served_alike() -> None:
-    """And what no view of training was as coarse as is not."""
+def test_views_as_coarse_as_training_views_are_not_supersampled() -> None:
+    """Views coarser than every training view are."""
     scene = tiny_scene(anchors=4)
     near, far = (orbit(i, 3, (32, 32), distance) for i, distance in enumerate((2.0, 2.5)))
     scene.sampling = SamplingRate.of([near, far, near], float(scene.extent))
@@ -85,13 +83,13 @@ def test_what_training_drew_a_little_coarser_is_served_alike() -> None:
     assert [supersampling(composition, orbit(0, 3, (32, 32), d)) for d in distances] == [1, 1, 1, 2]
 
 
-def test_a_single_close_up_does_not_make_all_other_pictures_dear() -> None:
+def test_a_single_close_up_does_not_change_the_sampling_rate() -> None:
     far = [orbit(i, 3, (32, 32), 4.0) for i in range(19)]
     assert SamplingRate.of([*far, orbit(0, 3, (32, 32), 1.0)], 1.0) == SamplingRate.of(far, 1.0)
 
 
 @pytest.mark.parametrize("share", [1 / 1.04, 1.0, 1.04])
-def test_what_looks_about_as_finely_is_drawn_as_in_training(share: float) -> None:
+def test_about_the_same_sampling_rate_counts_as_equal(share: float) -> None:
     scene = trained_on(tiny_scene(anchors=4), (32, 32))
     camera = orbit(1, 3, (32, 32))
     other = replace(camera, fx=share * camera.fx, fy=share * camera.fy)
@@ -100,7 +98,7 @@ def test_what_looks_about_as_finely_is_drawn_as_in_training(share: float) -> Non
 
 
 @pytest.mark.parametrize("parts", [2, 4])
-def test_a_small_picture_is_the_mean_of_the_one_of_training(parts: int) -> None:
+def test_a_small_image_is_the_box_average_of_the_training_size(parts: int) -> None:
     scene = trained_on(tiny_scene(anchors=40), (64, 64))
     large = orbit(0, 3, (64, 64))
     whole = render(scene, large, 0.5, WHITE)
@@ -116,10 +114,8 @@ def test_a_small_picture_is_the_mean_of_the_one_of_training(parts: int) -> None:
     ("size", "shape", "distance"),
     [(43, (43, 43), 4), (56, (56, 56), 4), (25, (25, 13), 4), (9, (9, 31), 4), (64, (64, 64), 8), (43, (43, 43), 13)],
 )
-def test_a_picture_that_looks_coarser_is_what_fell_onto_its_pixels(
-    size: int, shape: tuple[int, int], distance: float
-) -> None:
-    """Smaller or from farther, against one with sixteen times the pixels: four times nearer than if drawn at once."""
+def test_supersampling_approaches_the_mean_over_each_pixel(size: int, shape: tuple[int, int], distance: float) -> None:
+    """Smaller or more distant views, compared with 16 x 16 samples per pixel: at most a quarter of the error."""
     scene = trained_on(tiny_scene(anchors=40), (64, 64))
     with torch.no_grad():
         scene.scaffold.log_scales -= 1.5  # about a pixel wide
@@ -134,7 +130,7 @@ def test_a_picture_that_looks_coarser_is_what_fell_onto_its_pixels(
     assert 4 * float((found - mean).square().mean()) < float((at_once - mean).square().mean())
 
 
-def test_as_many_parts_as_training_had_pixels_and_no_more_than_memory_bears() -> None:
+def test_supersampling_matches_the_training_rate_within_the_memory_limit() -> None:
     scene = trained_on(tiny_scene(anchors=4), (64, 64))
     camera = orbit(0, 3, (64, 64))
     composition = scene.compose(camera.center, 0.5)
@@ -146,11 +142,11 @@ def test_as_many_parts_as_training_had_pixels_and_no_more_than_memory_bears() ->
     assert [parts(share) for share in (4, 1, 0.96, 0.94, 0.5, 0.49, 0.26, 0.1)] == [1, 1, 1, 2, 2, 2, 4, 10]
     assert parts(0.01, 4096, 4096) == 1
     assert parts(0.01, 1920, 1080) == 2
-    assert parts(1e-200) == math.isqrt(MOST_PIXELS // 64**2)
+    assert parts(1e-200) == math.isqrt(MAX_SUPERSAMPLED_PIXELS // 64**2)
 
 
 @pytest.mark.parametrize("focal", [1e-300, 1e-200, 1e200, 1e300])
-def test_no_field_of_view_is_too_wide_or_too_narrow(focal: float) -> None:
+def test_extreme_fields_of_view_give_finite_images(focal: float) -> None:
     scene = trained_on(tiny_scene(anchors=4), (64, 64))
     camera = replace(orbit(0, 3, (16, 16)), fx=focal, fy=focal)
     assert bool(render(scene, camera, 0.5, WHITE).color.isfinite().all())

@@ -1,7 +1,7 @@
 """Camera: intrinsics and pose. View: a camera at a time.
 
 Axes are OpenCV's: x right, y down, z forward. Pixel (i, j) has its centre at (i + 0.5, j + 0.5).
-All lengths are in normalised units (`graings.camera.units`). Knows nothing of images, scenes or files.
+All lengths are in normalised units (`graings.camera.units`).
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from numpy.typing import ArrayLike, NDArray
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
-_NEAREST = 1e-9  # depths below are taken for it, where a point is projected that may lie anywhere
-_EXACT = 1e-12  # an orthonormal matrix in float64 is no worse, so that one that was made exact stays as it is
+_MIN_DEPTH = 1e-9  # smaller depths are replaced by this one when arbitrary points are projected
+_ORTHONORMAL_TOLERANCE = 1e-12  # rounding of an orthonormal float64 matrix; such a matrix is left unchanged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A pinhole camera.
 
-    `world_to_camera` is [4, 4] float64 and rigid (a rotation rounded to single precision becomes the nearest exact
-    one: else the centre and the translation would disagree); `fx, fy, cx, cy` are in pixels;
-    u = fx X/Z + cx, v = fy Y/Z + cy. Raises `ValueError` for anything a pinhole cannot be.
+    `world_to_camera` is [4, 4] float64 and rigid; a rotation rounded to single precision is replaced by the nearest
+    exact one, so that the centre and the translation agree. `fx, fy, cx, cy` are in pixels: u = fx X/Z + cx,
+    v = fy Y/Z + cy. Raises `ValueError` for a pose that is not rigid and for intrinsics or sizes out of range.
     """
 
     world_to_camera: Matrix
@@ -52,7 +52,7 @@ class Camera:
             raise ValueError(f"intrinsics must be finite with fx, fy > 0, got {intrinsics}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"image size must be at least 1x1, got {self.width}x{self.height}")
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _EXACT:
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ORTHONORMAL_TOLERANCE:
             left, _, right = np.linalg.svd(rotation)
             pose[:3, :3] = left @ right
         pose.flags.writeable = False
@@ -70,17 +70,17 @@ class Camera:
         return 2.0 * math.atan2(self.width, 2.0 * self.fx)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view sampled on a grid of `width` x `height` pixels."""
+        """The same field of view sampled by `width` x `height` pixels."""
         sx, sy = width / self.width, height / self.height
         return Camera(self.world_to_camera, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
     def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where `points` [M, 3] appear, [M, 2] in px, and how deep they lie, [M].
+        """Projected positions [M, 2] in px and depths [M] of `points` [M, 3].
 
-        Of what does not lie in front of the camera the pixel means nothing.
+        The position of a point that is not in front of the camera is finite but has no meaning.
         """
         local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
-        depth = np.maximum(local[:, 2], _NEAREST)
+        depth = np.maximum(local[:, 2], _MIN_DEPTH)
         x, y = self.fx * local[:, 0] / depth + self.cx, self.fy * local[:, 1] / depth + self.cy
         return np.column_stack([x, y]), local[:, 2]
 
@@ -94,7 +94,7 @@ class Camera:
         width: int,
         height: int,
     ) -> Camera:
-        """A camera at `eye` [3] that looks at `target` [3]; `fov` is horizontal, in radians."""
+        """A camera at `eye` [3] looking at `target` [3]; `fov` is the full horizontal angle in radians."""
         eye_, target_, up_ = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
         forward = target_ - eye_
         distance = float(np.linalg.norm(forward))
@@ -103,7 +103,7 @@ class Camera:
         forward = forward / distance
         right = np.cross(forward, up_)
         if np.linalg.norm(right) < 1e-6 * np.linalg.norm(up_):
-            # Looking along `up`: any sideways axis will do; take the world axis farthest from it.
+            # The camera looks along `up`: use the world axis farthest from the viewing direction instead.
             right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
         right = right / np.linalg.norm(right)
         down = np.cross(forward, right)

@@ -1,4 +1,4 @@
-"""SamplingRate: how finely the training views sample the content, in pixels per unit of length."""
+"""SamplingRate: the resolution at which the training views sample the scene, in pixels per unit of length."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 
 from graings.camera.camera import Camera
 
-REFERENCE_QUANTILE = 0.9  # of the cameras of training do not look finer than the reference
-RATE_TOLERANCE = 1.05  # so many times finer or coarser makes no difference
-MAX_DIRECT_RATIO = 1.5  # times coarser than the reference: down to there what training drew is served alike
+REFERENCE_QUANTILE = 0.9  # of the rates of the training cameras: the reference
+RATE_TOLERANCE = 1.05  # rates within this factor count as equal
+MAX_DIRECT_RATIO = 1.5  # views at most this much coarser than the reference may be drawn without supersampling
 
 
 @dataclass(frozen=True, slots=True)
 class SamplingRate:
-    """How finely the cameras of training look at the content, which lies within `extent` of the origin.
+    """Sampling rates of the training cameras, in px per normalised unit; the scene lies within `extent` of the origin.
 
-    `reference`, in px per normalised unit at the origin, is what nine of ten of them do not exceed: the details of the
-    near ones count, and a single close-up does not. `coarsest` is what is still drawn at once, as training draws all:
-    the coarsest of them, but not much below the reference. A camera's own is sqrt(fx fy) over its distance, or over the
-    extent where it is nearer than that and so amid the content.
+    The rate of a camera is sqrt(fx fy) over its distance from the origin, or over `extent` if it is nearer than that.
+    `reference` is the 0.9 quantile over the training cameras: close views count, but a single close-up does not.
+    `coarsest` is the smallest rate that is drawn without supersampling: that of the coarsest training camera, but at
+    least `reference / MAX_DIRECT_RATIO`.
     """
 
     extent: float
@@ -31,21 +31,21 @@ class SamplingRate:
 
     @staticmethod
     def of(cameras: Sequence[Camera], extent: float) -> SamplingRate:
-        """That of at least one camera."""
-        every = [_sampling(camera, extent) for camera in cameras]
-        reference = float(np.quantile(every, REFERENCE_QUANTILE))
-        return SamplingRate(extent, reference, min(reference, max(min(every), reference / MAX_DIRECT_RATIO)))
+        """The rates of `cameras`, at least one."""
+        rates = [_rate(camera, extent) for camera in cameras]
+        reference = float(np.quantile(rates, REFERENCE_QUANTILE))
+        return SamplingRate(extent, reference, min(reference, max(min(rates), reference / MAX_DIRECT_RATIO)))
 
     def relative_rate(self, camera: Camera) -> float:
-        """How many times finer than the reference `camera` looks; below 1 if coarser, 1 if about alike."""
-        own = _sampling(camera, self.extent)
-        return own / min(max(own, self.reference / RATE_TOLERANCE), self.reference * RATE_TOLERANCE)
+        """The rate of `camera` over the reference: above 1 if finer, below 1 if coarser, 1 within the tolerance."""
+        rate = _rate(camera, self.extent)
+        return rate / min(max(rate, self.reference / RATE_TOLERANCE), self.reference * RATE_TOLERANCE)
 
     def undersampling(self, camera: Camera) -> float:
-        """How many times coarser `camera` looks than what is drawn at once; 1 and less if it is not coarser."""
-        return self.coarsest / RATE_TOLERANCE / _sampling(camera, self.extent)
+        """How many times coarser `camera` is than `coarsest`; at most 1 if it needs no supersampling."""
+        return self.coarsest / RATE_TOLERANCE / _rate(camera, self.extent)
 
 
-def _sampling(camera: Camera, extent: float) -> float:
+def _rate(camera: Camera, extent: float) -> float:
     distance = max(float(np.linalg.norm(camera.center)), extent)
     return math.sqrt(camera.fx) * math.sqrt(camera.fy) / distance

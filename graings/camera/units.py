@@ -1,8 +1,7 @@
-"""Units: the change from a capture's lengths and times to normalised ones, and back.
+"""Units: conversion between a capture's lengths and times and normalised ones.
 
-Lengths are scaled by a power of two, which floating point does exactly: a capture scaled by 2^k trains
-and renders to the same bits. Times are mapped to [0, 1] in float64 before anything becomes float32.
-Knows nothing of files.
+Lengths are scaled by a power of two, which is exact in floating point: a capture scaled by 2^k trains and renders
+to the same bits. Times are mapped to [0, 1] in float64 before they are converted to float32.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from graings.camera.camera import Camera
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """x' = scale (x - center), t' = (t - time_start) / time_span; `time_span` 0 means a single instant.
+    """x' = scale (x - center), t' = (t - time_start) / time_span; `time_span` 0 means a single time.
 
     `up` is the capture's vertical axis, unit length, for orbits around the scene.
     """
@@ -56,5 +55,5 @@ class Units:
         return pose
 
     def time(self, time: float) -> float:
-        """A capture's time stamp mapped to [0, 1] (0 where the capture is a single instant)."""
+        """A capture's time stamp mapped to [0, 1] (0 if the capture has a single time)."""
         return (float(time) - self.time_start) / self.time_span if self.time_span > 0 else 0.0

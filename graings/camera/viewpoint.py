@@ -1,8 +1,7 @@
-"""Viewpoint: from what a person asks for to a camera and a background.
+"""Viewpoint: cameras and backgrounds from the parameters of a command or an HTTP request.
 
-Requests come in the capture's own units, angles in degrees; the camera that goes out is normalised
-(`graings.camera.units`). What is not asked for is taken from the training views. The command line and the service
-both ask here. Knows nothing of scenes, images or HTTP.
+Parameters are in the capture's own units, angles in degrees; the camera is in normalised units
+(`graings.camera.units`). Missing parameters are taken from the training views.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike
 from graings.camera.camera import Camera, Vector, View
 from graings.camera.units import Units
 
-# Orbits stay between these distances, in normalised units: beyond them a camera's place is lost to rounding.
+# Bounds of an orbit's radius in normalised units; beyond them rounding makes the camera's position meaningless.
 MIN_DISTANCE, MAX_DISTANCE = 1e-9, 1e9
 
 
@@ -33,9 +32,9 @@ def orbit_view(
 ) -> Camera:
     """A camera on a sphere around `target`, looking at it.
 
-    `azimuth` turns about the capture's vertical, `elevation` rises from the horizon, both in degrees; `radius`
-    and `target` [3] are in capture units, `fov` is the full horizontal angle in degrees. Left out, they are azimuth
-    0, the median radius and elevation of `model_views`, the scene's centre, and the first view's angle and size.
+    `azimuth` is about the capture's vertical axis, `elevation` above the horizon, both in degrees; `radius` and
+    `target` [3] are in capture units, `fov` is the full horizontal angle in degrees. Defaults: azimuth 0, the median
+    radius and elevation of `model_views`, the scene's centre, and the field of view and size of the first view.
     Raises `ValueError` naming the parameter.
     """
     if not model_views:
@@ -52,7 +51,7 @@ def orbit_view(
     if radius is None:
         radius = float(np.median(lengths)) / units.scale
     if elevation is None:
-        # A camera that sits exactly on the target has no direction; it counts as level.
+        # A camera exactly at the target has no elevation; it counts as 0 degrees.
         sines = arms @ up / np.where(lengths > 0, lengths, 1.0)
         elevation = math.degrees(float(np.median(np.arcsin(np.clip(sines, -1.0, 1.0)))))
     azimuth = 0.0 if azimuth is None else azimuth
@@ -82,7 +81,7 @@ def orbit_view(
 
 
 def named_view(views: Mapping[str, Sequence[View]], name: str) -> View:
-    """The view called `split:index`, such as `test:3`, counted from 0. Raises `ValueError` saying what there is."""
+    """The view called `split:index`, such as `test:3`, counted from 0. Raises `ValueError` naming those that exist."""
     split, colon, index = name.partition(":")
     if not colon or not (index.isascii() and index.isdigit()):
         raise ValueError(f"camera must look like split:index, for example train:0, got {name!r}")
@@ -91,7 +90,7 @@ def named_view(views: Mapping[str, Sequence[View]], name: str) -> View:
     chosen = views[split]
     if int(index) >= len(chosen):
         have = f"its views are {split}:0 to {split}:{len(chosen) - 1}" if chosen else "it has no views"
-        raise ValueError(f"camera {name!r}: the split {split!r} ends before that; {have}")
+        raise ValueError(f"camera {name!r}: the index is out of range; {have}")
     return chosen[int(index)]
 
 
@@ -108,8 +107,8 @@ def pose_camera(
 def sized(camera: Camera, width: int | None = None, height: int | None = None) -> Camera:
     """The same viewpoint at another image size.
 
-    One length alone keeps the picture's shape. Both together keep the horizontal field of view and show more or
-    less above and below: pixels stay as square as they were.
+    Width or height alone keeps the aspect ratio. Both together keep the horizontal field of view and crop or extend
+    the image vertically, so that the pixel aspect ratio stays the same.
     """
     width_, height_ = _size(camera, width, height)
     zoom = width_ / camera.width

@@ -1,4 +1,4 @@
-"""A configuration from a preset and single options, from a stored document, and the JSON schema of all options."""
+"""Configurations from a preset with overrides or from a stored document, and the JSON Schema of all options."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from graings.config.sections import ConfigSection
 from graings.config.train_config import TrainConfig
 from graings.errors import CheckpointError, ConfigError
 
-MAX_DEPTH: Final = 8  # more levels than any option has
+MAX_DEPTH: Final = 8  # bounds the recursion; options have two levels
 
 Stored = TypeVar("Stored", bound=ConfigSection)
 
 
 def make_config(preset: str = "standard", overrides: dict[str, Any] | None = None) -> TrainConfig:
-    """A preset with overrides, which are nested like the config or flat with dotted keys (`"loss.ssim": 0.1`).
+    """A preset with overrides, nested like the config or flat with dotted keys (`"loss.ssim": 0.1`).
 
-    Raises `ConfigError` naming the field for anything unknown or out of range.
+    Raises `ConfigError` naming any field that is unknown or out of range.
     """
     overrides = dict(overrides or {})
     preset = str(overrides.pop("preset", preset))
@@ -35,7 +35,7 @@ def make_config(preset: str = "standard", overrides: dict[str, Any] | None = Non
 
 
 def restored(kind: type[Stored], values: Any, source: Path) -> Stored:
-    """Options as a file of ours holds them. Raises `CheckpointError` naming the file and the fields it got wrong."""
+    """Options read from a stored file. Raises `CheckpointError` naming the file and the invalid fields."""
     try:
         return kind.model_validate(values)
     except ValidationError as error:
@@ -53,21 +53,22 @@ def _merge(into: dict[str, Any], values: dict[str, Any], depth: int = 0) -> None
     for key, value in values.items():
         head, _, rest = key.partition(".")
         if depth > MAX_DEPTH:
-            raise ConfigError(f"{head[:40]}: no option has so many parts. `graings options` lists every field.")
+            raise ConfigError(
+                f"{head[:40]}: an option name has at most {MAX_DEPTH} parts. `graings options` lists every field."
+            )
         if rest:
             value = {rest: value}
         if isinstance(value, dict):
             child = into.setdefault(head, {})
             if not isinstance(child, dict):
-                part = "no parts" if not value else f"no part {next(iter(value))!r}"
-                raise ConfigError(f"{head}: is a value, it has {part}. `graings options` lists every field.")
+                raise ConfigError(f"{head}: is a single value, not a section. `graings options` lists every field.")
             _merge(child, value, depth + 1)
         else:
             into[head] = value
 
 
 def options() -> dict[str, Any]:
-    """JSON schema of every option with default, bounds and help, and the presets."""
+    """The JSON Schema of all options, with defaults, bounds and descriptions, and the values of every preset."""
     return {
         "schema": TrainConfig.model_json_schema(),
         "presets": {name: make_config(name).model_dump(mode="json") for name in PRESETS},

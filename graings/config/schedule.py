@@ -7,13 +7,13 @@ from typing import Final, Literal
 
 from graings.config.train_config import TrainConfig
 
-# Phases of a run that count as training; evaluation, checkpoints and the like are reported beside them.
+# Phases whose time counts as training time; evaluation and checkpoints are reported separately.
 TRAINING_PHASES: Final = ("init", "warmup", "joint", "static")
 
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """Iterations `first` to `last` (inclusive, from 1); `temporal` switches the time modules on."""
+    """Iterations `first` to `last` (inclusive, from 1); `temporal` enables the time-dependent networks."""
 
     name: Literal["warmup", "joint", "static"]
     first: int

@@ -1,7 +1,7 @@
-"""The sections of the options: every number a user may choose, with its bounds, default and one line of help.
+"""The sections of the options: every number a user may set, with default, bounds and a description.
 
-Each section is read by one package only, named in its docstring. Iteration marks are those of the paper's
-30 000-iteration schedule and are scaled with `iterations`, so that a shorter run keeps the shape of the schedule.
+Each section is read by one package, named in its docstring. Iterations "in a schedule of 30 000", the paper's, are
+scaled with `iterations`, so that a shorter run has the same proportions. Descriptions are shown by `graings options`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class ConfigSection(BaseModel):
-    """Strict base of all parts: unknown fields and non-finite numbers are refused; values are frozen."""
+    """Strict base class: unknown fields and non-finite numbers are refused; values are frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -22,218 +22,264 @@ FirstAndLast = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)
 
 
 class CaptureConfig(ConfigSection):
-    """How images are read. Owner: `graings.capture`."""
+    """How images are read. Read by `graings.capture`."""
 
     max_side: int | None = Field(
-        400, ge=16, le=16384, description="Longest image side in px; null keeps the files' size."
+        400,
+        ge=16,
+        le=16384,
+        description="Longest image side in px; larger images are scaled down. null: keep the size of the files.",
     )
     background: Literal["auto", "white", "black"] | tuple[Channel, Channel, Channel] = Field(
         "auto",
-        description="Colour behind transparent pixels, and what needs no Gaussians where it is seen: white, black or "
-        "[r, g, b] in [0, 1]. auto: the colour around what opaque pictures show if it is one, else white.",
+        description="Colour behind transparent pixels, and behind the scene when it is rendered: white, black or "
+        "[r, g, b] in [0, 1]. auto: the colour of the borders of opaque images if they have a single one, else white.",
     )
     times_from_names: bool = Field(
-        False, description="Take times from the number in the file name where the capture gives none."
+        False, description="Read the time of a frame from the number in its file name if the capture has no times."
     )
     test_every: int = Field(
         8,
         ge=2,
-        description="COLMAP, transforms.json: every n-th image by name is held out for test if there is no split; of "
-        "a rig of n or more cameras every n-th camera.",
+        description="COLMAP and transforms.json without a split: every n-th image by name is held out for testing; "
+        "with a rig of n or more cameras, every n-th camera.",
     )
-    cache_mb: int = Field(1024, ge=16, description="Memory for decoded images in MB.")
+    cache_mb: int = Field(1024, ge=16, description="Memory for the cache of decoded images, MB.")
 
     def background_rgb(self) -> tuple[float, float, float]:
-        """The background as RGB in [0, 1]; white while it is left to the pictures."""
+        """The background as RGB in [0, 1]; white for `auto`, before the images have been read."""
         named = {"auto": (1.0, 1.0, 1.0), "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
         return named[self.background] if isinstance(self.background, str) else self.background
 
 
 class SceneConfig(ConfigSection):
-    """Shape of the model and the paper's structural ablations. Owner: `graings.scene`."""
+    """Structure of the model, with the paper's structural ablations. Read by `graings.scene`."""
 
     children: int = Field(10, ge=1, le=32, description="Child Gaussians per anchor (k).")
-    feature_dim: int = Field(64, ge=1, le=256, description="Length of the anchor feature (d_f).")
+    feature_dim: int = Field(64, ge=1, le=256, description="Dimension of the anchor feature (d_f).")
     head_width: int = Field(96, ge=4, le=512, description="Hidden width of the colour, opacity and residual heads.")
     static_width: int = Field(64, ge=4, le=512, description="Hidden width of StaticMLP.")
     deform_width: int = Field(128, ge=4, le=1024, description="Hidden width of DeformNet.")
-    deform_depth: int = Field(3, ge=1, le=12, description="Hidden layers of DeformNet.")
-    position_frequencies: int = Field(6, ge=0, le=16, description="Octaves of the position encoding in DeformNet.")
+    deform_depth: int = Field(3, ge=1, le=12, description="Number of hidden layers of DeformNet.")
+    position_frequencies: int = Field(
+        6, ge=0, le=16, description="Number of frequencies (octaves) of the position encoding in DeformNet."
+    )
     time_conditioning: Literal["factorized", "concatenated"] = Field(
         "factorized",
-        description="How time enters DeformNet. factorized: W (phi(x) * psi(t)), motions of a position weighted by a "
-        "function of time; concatenated: one network of position and time.",
+        description="How DeformNet depends on time. factorized: W (phi(x) * psi(t)), the elementwise product of a "
+        "network of position and a network of time; concatenated: one network of position and time, as in the paper.",
     )
-    time_frequencies: int = Field(6, ge=0, le=16, description="Octaves of the time encoding (L).")
+    time_frequencies: int = Field(
+        6, ge=0, le=16, description="Number of frequencies (octaves) of the time encoding (L)."
+    )
     time_width: int = Field(
-        256, ge=4, le=4096, description="Hidden width of psi, the function of time in a product; it runs once a frame."
+        256,
+        ge=4,
+        le=4096,
+        description="Hidden width of psi, the network of time in the factorized DeformNet; evaluated once per frame.",
     )
-    residual_scale: float = Field(0.1, ge=0, le=1, description="Bound of the appearance residual (eta).")
+    residual_scale: float = Field(0.1, ge=0, le=1, description="Bound of the temporal appearance residual (eta).")
     deformation: Literal["child", "anchor", "none"] = Field(
-        "child", description="child: an offset per Gaussian (the method); anchor: broadcast per anchor; none: static."
+        "child",
+        description="child: one deformation per Gaussian (the paper's method); anchor: one per anchor, shared by its "
+        "children; none: a static scene.",
     )
-    stop_gradient: bool = Field(True, description="Detach the canonical position before DeformNet (Eq. 7).")
-    single_mlp: bool = Field(False, description="Ablation: one network for canonical and temporal geometry.")
+    stop_gradient: bool = Field(True, description="Stop the gradient from DeformNet to the canonical position (Eq. 7).")
+    single_mlp: bool = Field(False, description="Ablation: a single network for canonical geometry and deformation.")
     residual: bool = Field(True, description="Temporal appearance residual (Eq. 12).")
     residual_sh_degree: int = Field(
         2,
         ge=0,
         le=3,
-        description="Degree up to which the residual of colour sees spherical harmonics of the viewing direction; 0 is "
-        "Eq. 12, which sees none.",
+        description="Highest degree of the spherical harmonics of the viewing direction that the colour residual "
+        "receives; 0: none, as in Eq. 12.",
     )
-    residual_stop_gradient: bool = Field(True, description="Detach the anchor feature before the residual field.")
-    canonical: bool = Field(True, description="Ablation when off: no canonical geometry branch and no warm-up.")
+    residual_stop_gradient: bool = Field(
+        True, description="Stop the gradient from the residual network to the anchor feature."
+    )
+    canonical: bool = Field(True, description="false, as an ablation: no network of canonical geometry and no warm-up.")
     color_sh_degree: int = Field(
         3,
         ge=1,
         le=3,
-        description="Degree up to which the colour head sees spherical harmonics of the viewing direction; 1 is the "
-        "direction itself.",
+        description="Highest degree of the spherical harmonics of the viewing direction that the colour head receives; "
+        "1: the direction itself.",
     )
     reflection: bool = Field(
         True,
-        description="Let the colour head also see the viewing direction mirrored at a normal that it reads from the "
-        "feature: where a highlight lies.",
+        description="Also give the colour head the viewing direction reflected at a normal predicted from the anchor "
+        "feature, for specular highlights.",
     )
     blur: float = Field(
         0.1,
         ge=0,
         le=10,
-        description="Low-pass of the picture: variance added to every footprint, in px^2 of the finer training "
-        "views, and as large on the scene in all others and in other pictures. A pixel's own box has 1/12, 3DGS 0.3.",
+        description="Low-pass filter: variance added to every projected Gaussian, in px^2 of the finer training views; "
+        "other views use the same width in the scene. A pixel's box filter has 1/12; 3DGS uses 0.3.",
     )
-    opacity_view: bool = Field(False, description="Feed the viewing direction to the opacity head, as the paper does.")
-    projected_clip: bool = Field(True, description="Let clipped values receive gradients that point back inside.")
+    opacity_view: bool = Field(False, description="Give the opacity head the viewing direction, as in the paper.")
+    projected_clip: bool = Field(
+        True, description="Let clipped values receive gradients that move them back into their range."
+    )
 
 
 class InitConfig(ConfigSection):
-    """The first anchors. Owner: `graings.training.initialization.initial_scene`."""
+    """The initial anchors. Read by `graings.training.initialization.initial_scene`."""
 
-    points: int = Field(240_000, ge=16, le=2_000_000, description="Random points where the capture has no cloud.")
+    points: int = Field(
+        240_000, ge=16, le=2_000_000, description="Number of random candidate points if the capture has no point cloud."
+    )
     min_mask_fraction: float = Field(
         0.6,
         ge=0,
         le=1,
-        description="Least share of views whose mask a random point must hit to stay; where more agree on enough, more "
-        "must. Where pictures are filled, places that pairs of them agree on are taken instead. 0 leaves random points "
-        "as they are.",
+        description="Visual hull: smallest fraction of the views in whose masks a random point must lie to be kept; "
+        "raised automatically if enough points remain. Images without a mask are triangulated in pairs instead. "
+        "0: keep all random points.",
     )
     max_points: int = Field(
         20_000,
         ge=16,
-        description="At most this many points become first anchors, wherever they come from; of a cloud's, or those "
-        "that pictures agree on, no more than `density.max_anchors` either.",
+        description="Maximum number of initial anchors. Points of a cloud and triangulated points are also limited to "
+        "`density.max_anchors`.",
     )
     voxel_size: float | None = Field(
-        None, ge=1e-9, description="Finest anchor cell, normalised; null: 0.7 px of the finer training views."
+        None,
+        ge=1e-9,
+        description="Side of the finest anchor voxel in normalised units; null: 0.7 px of the finer training views.",
     )
-    offset_std: float = Field(0.3, ge=0, le=10, description="Spread of the first child offsets in units of s_a.")
-    opacity: float = Field(0.1, gt=0.004, lt=0.99, description="Opacity score that all children start with.")
+    offset_std: float = Field(
+        0.3, ge=0, le=10, description="Standard deviation of the initial child offsets, in units of s_a."
+    )
+    opacity: float = Field(0.1, gt=0.004, lt=0.99, description="Initial opacity of all children.")
 
 
 class LossConfig(ConfigSection):
-    """Weights of Eq. 14-18, alpha and rigidity; 0 leaves a term out. Owner: `graings.training.losses`."""
+    """Weights of the loss terms, Eq. 14-18, alpha and rigidity; 0 omits a term. Read by `graings.training.losses`."""
 
-    ssim: float = Field(0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss.")
+    ssim: float = Field(
+        0.2, ge=0, le=1, description="Weight of D-SSIM in the photometric loss; L1 has the rest (Eq. 15)."
+    )
     squared: float = Field(
         10.0,
         ge=0,
-        description="Weight of the mean squared error, which joins the photometric loss after the last growth. Not in "
-        "the paper: absolute differences let a few large errors stand.",
+        description="Weight of the mean squared error, which is added to the photometric loss after the last growth. "
+        "Not in the paper: L1 alone tolerates a few large errors.",
     )
     alpha: float = Field(
         0.03,
         ge=0,
-        description="Weight of the difference between the opacity drawn and the pictures' alpha, where they have one. "
-        "Not in the paper: what has the background's colour may else be a hole, and empty space be veiled by it.",
+        description="Weight of the difference between rendered and given alpha, for images with an alpha channel. Not "
+        "in the paper: without it surfaces of the background's colour may have holes, and empty space may be opaque.",
     )
-    temporal: float = Field(0.01, ge=0, description="lambda_1, temporal smoothness of the position offset.")
-    deformation: float = Field(0.001, ge=0, description="lambda_2, magnitude of the deformation.")
-    residual: float = Field(0.01, ge=0, description="lambda_3, magnitude of the appearance residual.")
+    temporal: float = Field(0.01, ge=0, description="lambda_1: temporal smoothness of the deformed positions.")
+    deformation: float = Field(0.001, ge=0, description="lambda_2: magnitude of the deformation.")
+    residual: float = Field(0.01, ge=0, description="lambda_3: magnitude of the appearance residual.")
     rigidity: float = Field(
         0.02,
         ge=0,
-        description="Weight of the strain between the instants of a step, that is how much neighbouring Gaussians come "
-        "apart. Not in the paper; a step of one view has none.",
+        description="Weight of local rigidity: how much the distances between neighbouring Gaussians change between "
+        "the times of a step's views. Not in the paper; without effect with a batch of 1.",
     )
-    temporal_share: float = Field(0.1, gt=0, le=1, description="Share of drawn children in the temporal term per step.")
+    temporal_share: float = Field(
+        0.1, gt=0, le=1, description="Fraction of the drawn children in the temporal term of each step."
+    )
 
 
 class DensityConfig(ConfigSection):
-    """Growing and pruning. Owner: `graings.training.density.growth`. Marks are of the 30 000 schedule."""
+    """Growing and pruning of anchors. Read by `graings.training.density`."""
 
-    statistics_from: int = Field(500, ge=0, description="First iteration of the growth statistics.")
-    grow_from: int = Field(1_500, ge=0, description="First growth.")
-    grow_until: int = Field(20_000, ge=0, description="Last growth.")
+    statistics_from: int = Field(
+        500, ge=0, description="First iteration of the growth statistics, in a schedule of 30 000."
+    )
+    grow_from: int = Field(1_500, ge=0, description="Iteration of the first growth, in a schedule of 30 000.")
+    grow_until: int = Field(20_000, ge=0, description="Iteration of the last growth, in a schedule of 30 000.")
     grow_every: int = Field(50, ge=1, description="Iterations between growths (not scaled).")
-    gradient_threshold: float = Field(2e-4, gt=0, description="tau_g, mean screen gradient in NDC units.")
-    min_observations: int = Field(40, ge=0, description="tau_obs, times a child must have been drawn (not scaled).")
-    levels: int = Field(3, ge=1, le=6, description="Cell sizes 4^(levels-1) v ... v.")
+    gradient_threshold: float = Field(
+        2e-4, gt=0, description="tau_g: mean screen-space gradient, NDC units, above which a child grows new anchors."
+    )
+    min_observations: int = Field(
+        40, ge=0, description="tau_obs: how often a child must have been drawn before it may grow (not scaled)."
+    )
+    levels: int = Field(3, ge=1, le=6, description="Number of voxel sizes for new anchors: 4^(levels-1) v, ..., v.")
     new_anchor_opacity: float | None = Field(
         None,
         gt=0.004,
         lt=0.99,
-        description="Opacity score that a new anchor's brightest child starts with; null inherits the parent's.",
+        description="Initial opacity of a new anchor's most opaque child; null: that of the parent.",
     )
-    max_anchors: int = Field(12_000, ge=16, description="Anchors up to which growth may go; the largest gradients win.")
+    max_anchors: int = Field(
+        12_000,
+        ge=16,
+        description="Maximum number of anchors after growth; candidates with the largest gradients are preferred.",
+    )
     memory_mb: int = Field(
-        4096, ge=1, description="Memory in MB that anchors and one training step may take; growth stops where it ends."
+        4096, ge=1, description="Memory budget for the anchors and one training step, MB; growth stops at it."
     )
-    prune_from: int = Field(24_600, ge=0, description="First pruning: about 80 % of the joint phase.")
-    prune_until: int = Field(29_000, ge=0, description="Last pruning.")
+    prune_from: int = Field(24_600, ge=0, description="Iteration of the first pruning, in a schedule of 30 000.")
+    prune_until: int = Field(29_000, ge=0, description="Iteration of the last pruning, in a schedule of 30 000.")
     prune_every: int = Field(500, ge=1, description="Iterations between prunings.")
-    prune_opacity: float = Field(0.005, ge=0, description="Anchors whose summed child opacity stays below are removed.")
+    prune_opacity: float = Field(
+        0.005, ge=0, description="Anchors whose summed child opacity stays below this are removed."
+    )
     prune_min_views: int = Field(
-        80, ge=1, description="Views an anchor must have been seen in before it may go (not scaled)."
+        80, ge=1, description="How many views must have seen an anchor before it may be removed (not scaled)."
     )
 
 
 class RatesConfig(ConfigSection):
-    """Learning rates, first and last (log-linear between). Owner: `graings.training.optimizer`.
+    """Learning rates, first and last, log-linear in between. Read by `graings.training.optimizer`.
 
-    They are Adam's; `matrices` is that of the matrices in `static` and `deformation` but for their last layers, unless
-    `matrix_optimizer` is adam.
+    They are those of Adam, except `matrices`: the hidden weight matrices of `static` and `deformation` under Muon.
     """
 
     offsets: FirstAndLast = Field((0.02, 1e-3), description="Child offsets, in units of s_a.")
     features: FirstAndLast = Field((0.0075, 0.003), description="Anchor features.")
     log_scales: FirstAndLast = Field((0.007, 0.003), description="log s_a of the anchors.")
-    opacity_offsets: FirstAndLast = Field((0.02, 0.002), description="What an anchor adds to its opacity logits.")
+    opacity_offsets: FirstAndLast = Field(
+        (0.02, 0.002), description="Offset that an anchor adds to the opacity logits of its children."
+    )
     static: FirstAndLast = Field((0.004, 0.0004), description="StaticMLP.")
-    color: FirstAndLast = Field((0.008, 2e-4), description="Colour head, with the normals of its mirror.")
+    color: FirstAndLast = Field(
+        (0.008, 2e-4), description="Colour head, including the network of its reflection normals."
+    )
     opacity: FirstAndLast = Field(
         (0.0007, 7e-6),
-        description="Opacity head. At three times as much a scene may fade before its colours fit, and stay so.",
+        description="Opacity head. At three times this rate a scene may become transparent before its colours fit.",
     )
-    residual: FirstAndLast = Field((0.002, 2e-5), description="Residual field of the appearance.")
+    residual: FirstAndLast = Field((0.002, 2e-5), description="Network of the temporal appearance residual.")
     deformation: FirstAndLast = Field((2e-3, 5e-5), description="DeformNet.")
     matrices: FirstAndLast = Field(
-        (2e-3, 5e-5), description="Hidden matrices of StaticMLP and DeformNet, where Muon steps them."
+        (2e-3, 5e-5), description="Hidden weight matrices of StaticMLP and DeformNet with matrix_optimizer muon."
     )
 
 
 class GuardConfig(ConfigSection):
-    """When a step is limited and when training goes back. Owner: `graings.training.guard.guard`."""
+    """Gradient clipping and rollback of a diverging run. Read by `graings.training.guard`."""
 
     clip: float = Field(
-        100.0, gt=1, le=1e6, description="A group's gradient above this many times its usual size is limited to it."
+        100.0,
+        gt=1,
+        le=1e6,
+        description="The gradient norm of a parameter group is clipped to this multiple of its recent median.",
     )
     excess: float = Field(
-        2.0, gt=1, le=100, description="A mean loss above this many times the best one counts as diverging."
+        2.0, gt=1, le=100, description="A mean loss above this multiple of the best one counts as diverging."
     )
-    patience: int = Field(200, ge=1, description="Steps in a row that may diverge before training goes back.")
+    patience: int = Field(200, ge=1, description="Consecutive diverging steps before training returns to a snapshot.")
     rollbacks: int = Field(
-        3, ge=0, le=20, description="Times training may go back to a good moment, each time with half the rates."
+        3, ge=0, le=20, description="Maximum number of returns to a snapshot; each one halves the learning rates."
     )
-    snapshot_every: int = Field(500, ge=1, description="Iterations between the moments kept to go back to.")
-    check_every: int = Field(100, ge=1, description="Iterations between checks of all parameters and moments.")
+    snapshot_every: int = Field(500, ge=1, description="Iterations between snapshots.")
+    check_every: int = Field(
+        100, ge=1, description="Iterations between checks that all parameters and optimizer moments are finite."
+    )
 
 
 class EvaluationConfig(ConfigSection):
-    """Held-out evaluation and checkpoints during a run. Owner: `graings.training.run`."""
+    """Held-out evaluation and checkpoints during a run. Read by `graings.training.run`."""
 
     first: int = Field(50, ge=1, description="Iteration of the first evaluation.")
-    factor: float = Field(1.5, gt=1, description="Each evaluation comes this many times later than the last.")
-    views: int = Field(8, ge=1, description="Held-out views per evaluation during training (all at the end).")
+    factor: float = Field(1.5, gt=1, description="Ratio between the iterations of successive evaluations.")
+    views: int = Field(8, ge=1, description="Held-out views per evaluation during training; all of them at the end.")
     checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")

@@ -21,50 +21,52 @@ from graings.config.sections import (
 
 
 class TrainConfig(ConfigSection):
-    """One training run."""
+    """All options of a training run."""
 
     preset: Literal["draft", "standard", "fine", "paper"] = Field(
-        "standard", description="Where the defaults come from."
+        "standard", description="Name of the set of defaults that the other options change."
     )
-    iterations: int = Field(5_000, ge=1, le=1_000_000, description="Optimisation steps.")
+    iterations: int = Field(5_000, ge=1, le=1_000_000, description="Number of optimisation steps.")
     batch: int = Field(
         4,
         ge=1,
         le=64,
-        description="Views per optimisation step, each at its own instant. What networks say of all instants alike is "
-        "computed once a step, and rates rise by the cube root.",
+        description="Views per optimisation step, each at its own time. Time-independent network outputs are computed "
+        "once per step, and learning rates are multiplied by the cube root of the batch.",
     )
-    warmup: int = Field(1_000, ge=0, description="Static warm-up T_w, of the 30 000 schedule; the paper has 3 000.")
+    warmup: int = Field(
+        1_000, ge=0, description="Length of the static warm-up T_w, in a schedule of 30 000; the paper has 3 000."
+    )
     average_from: int = Field(
         29_000,
         ge=0,
-        description="After this mark of the 30 000 schedule, and the last growth and pruning, parameters are averaged; "
-        "training ends with their mean. 30000: never.",
+        description="Iteration, in a schedule of 30 000, after which parameters are averaged, once growth and pruning "
+        "have ended; the trained model is this average. 30000: no averaging.",
     )
     time_window: float | None = Field(
         None,
         gt=0,
         le=1,
-        description="Share of the clip, around its middle, whose views training begins with; 1 takes all. null: the "
-        "widest in which what the masks show stays in place, which is all of most clips, and less, from the start once "
-        "more, where training loses something all the same.",
+        description="Fraction of the clip, around its middle, whose views training starts with; 1: all. null: the "
+        "largest fraction in which the masks of all times overlap, which is 1 for most clips; if a moving object is "
+        "missing later, training restarts with a smaller one.",
     )
     time_window_until: int = Field(
-        7_500, ge=0, description="Mark of the 30 000 schedule at which the window has widened to the whole clip."
+        7_500, ge=0, description="Iteration, in a schedule of 30 000, at which the time window covers the whole clip."
     )
     low_resolution_until: int = Field(
         0,
         ge=0,
-        description="Mark of the 30 000 schedule until which training looks at smaller pictures: a half of each side, "
-        "or a quarter before, and so on, as long as 200 px remain. 0: never.",
+        description="Iteration, in a schedule of 30 000, until which training uses reduced images: half of each side, "
+        "a quarter before that, and so on, as long as 200 px remain. 0: full resolution from the start.",
     )
     matrix_optimizer: Literal["muon", "adam"] = Field(
         "muon",
-        description="How weight matrices of StaticMLP and DeformNet step. muon: orthogonalised momentum; adam: as the "
-        "rest.",
+        description="Optimizer of the hidden weight matrices of StaticMLP and DeformNet. muon: orthogonalised "
+        "momentum; adam: Adam, as for all other parameters.",
     )
-    seed: int = Field(0, ge=0, lt=2**31, description="Seed of every random stream.")
-    threads: int | None = Field(None, ge=1, le=256, description="CPU threads; null takes all cores.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Seed of all random streams.")
+    threads: int | None = Field(None, ge=1, le=256, description="Number of CPU threads; null: all cores.")
     capture: CaptureConfig = CaptureConfig()
     scene: SceneConfig = SceneConfig()
     init: InitConfig = InitConfig()
@@ -77,7 +79,7 @@ class TrainConfig(ConfigSection):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_preset(cls, values: Any) -> Any:
-        """What is not given is as in the preset that is, so that its name never stands over other values."""
+        """Fills values that are not given from the preset, so that its name always matches the defaults."""
         if not isinstance(values, dict):
             return values
         name = values.get("preset", "standard")
@@ -92,5 +94,5 @@ class TrainConfig(ConfigSection):
         return filled
 
     def scaled(self, mark: int) -> int:
-        """An iteration mark of the 30 000 schedule, in this run's iterations."""
+        """The iteration of this run at a mark of the schedule of 30 000 iterations."""
         return round(mark * self.iterations / PAPER_ITERATIONS)

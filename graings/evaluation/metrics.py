@@ -20,6 +20,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from graings.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from graings.document import Document
 
 Image = NDArray[np.float64]
@@ -27,12 +28,6 @@ Image = NDArray[np.float64]
 # Below this mean squared error PSNR is 100 dB: the logarithm of 0, the error of two equal images, is not finite.
 MSE_FLOOR: Final = 1e-10
 PSNR_CAP: Final = 100.0
-
-# SSIM as 3D Gaussian Splatting defines it, for values in [0, 1]: (0.01)^2 and (0.03)^2.
-SSIM_WINDOW: Final = 11
-SSIM_SIGMA: Final = 1.5
-SSIM_C1: Final = 1e-4
-SSIM_C2: Final = 9e-4
 
 # VGG halves the image five times, which leaves no pixel of a smaller image.
 LPIPS_MIN_SIDE: Final = 32

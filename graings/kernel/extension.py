@@ -1,6 +1,6 @@
-"""The compiled extension: the one place that imports it, and the instruction set it runs with.
+"""The compiled extension, built from `csrc/`, and the instruction set it uses.
 
-`csrc/` is its source. Says what to do where it is not built or cannot run on this CPU.
+All other modules access the extension through `kernel()`, which raises an error with a remedy if it cannot be loaded.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from graings.errors import KernelError
 
 
 def keep_freed_memory() -> None:
-    """Have the C library keep freed memory for the next step instead of giving it back; no effect without glibc.
+    """Make the C library keep freed memory for the next step instead of returning it; no effect without glibc.
 
-    A step frees and wants the same tens of megabytes again; fetching them from the system, page by page, took a
-    fifth of its time.
+    Every step allocates and frees the same tens of megabytes. Fetching them from the operating system page by page
+    took a fifth of its time.
     """
     kernel().keep_freed_memory()
 
 
 @cache
 def kernel() -> ModuleType:
-    """The extension module. Raises `KernelError` when it is not built or GRAINGS_ISA asks for the impossible."""
+    """The extension module. Raises `KernelError` if it is not built or GRAINGS_ISA is not available here."""
     try:
         module = importlib.import_module("graings.kernel._kernel")
     except ImportError as error:
@@ -49,5 +49,5 @@ def available_isas() -> tuple[str, ...]:
 
 
 def use_isa(name: str) -> None:
-    """Choose an instruction set for the whole process. Raises `ValueError` when it cannot run here."""
+    """Select an instruction set for the whole process. Raises `ValueError` if it cannot run on this CPU."""
     kernel().use_isa(name)

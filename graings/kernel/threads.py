@@ -1,7 +1,7 @@
-"""CPU threads: how many this process computes with.
+"""Number of CPU threads of this process.
 
-The kernel has its own pool. Torch is kept at one thread: its many small operations would each end in a barrier that
-waits for a core which another process may hold, and its sums would depend on the number of threads.
+The kernel has its own thread pool. Torch uses one thread: each of its many small operations would end in a barrier
+that may wait for a core used by another process, and its sums would depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ _threads: int | None = None
 
 
 def thread_count() -> int:
-    """Threads an operator takes when its caller does not say: those of `set_threads`, else all usable cores."""
+    """Default number of threads of an operator: that of `set_threads`, else all usable cores."""
     return usable_cores() if _threads is None else _threads
 
 
 def set_threads(count: int | None) -> None:
-    """Choose what `thread_count()` says, for the whole process; None: all usable cores."""
+    """Set the default number of threads for the whole process; None: all usable cores."""
     global _threads
     if count is not None and count < 1:
         raise ValueError(f"threads must be at least 1, got {count}")
@@ -31,12 +31,12 @@ def set_threads(count: int | None) -> None:
 
 
 def usable_cores() -> int:
-    """Cores this process may run on."""
+    """Number of cores this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def use_threads(count: int | None) -> int:
-    """Compute with `count` CPU threads from now on (None: all cores this process may use); returns their number."""
+    """Set up this process for `count` CPU threads (None: all usable cores) and return their number."""
     torch.set_num_threads(1)
     set_threads(count)
     keep_freed_memory()

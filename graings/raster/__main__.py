@@ -1,4 +1,4 @@
-"""`python -m graings.raster` prints which instruction set draws and which others this CPU could run."""
+"""`python -m graings.raster` prints the instruction set in use and those that this CPU can run."""
 
 from __future__ import annotations
 

@@ -1,19 +1,23 @@
-"""What a rasterizer accepts beyond what `Gaussians` and `Camera` already check.
+"""Checks of a rasterizer's arguments beyond those of `Gaussians` and `Camera`.
 
-Shared by the kernel's front and its oracle, so that both refuse the same calls with the same words.
+Shared by the kernel's Python side and the slow reference, so that both refuse the same calls with the same messages.
 """
 
 from __future__ import annotations
 
+from jaxtyping import Float
 from torch import Tensor
 
 from graings.gaussians import Gaussians
 
 
 def check_arguments(
-    gaussians: Gaussians, background: Tensor, means2d_offset: Tensor | None, threads: int | None
+    gaussians: Gaussians,
+    background: Float[Tensor, " 3"],
+    means2d_offset: Float[Tensor, "gaussian 2"] | None,
+    threads: int | None,
 ) -> None:
-    """Raise `ValueError` naming the argument, what was expected and what came."""
+    """Raise `ValueError` naming the argument, the expected value and the given one."""
     dtype = gaussians.means.dtype
     _check("background", background, (3,), dtype)
     if means2d_offset is not None:

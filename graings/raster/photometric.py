@@ -1,8 +1,8 @@
 """How far an image is from its target: structural similarity, absolute and squared difference, with their gradient.
 
-Fused in the compiled kernel. SSIM in the 3DGS definition: 11x11 Gaussian window of sigma 1.5, zero padding,
-C1 = 0.01^2, C2 = 0.03^2, per channel; local variances are clamped at 0 and local values to [-1, 1], with zero
-gradient where clamped. Meant for losses; `graings.evaluation.metrics` measures. Knows nothing of cameras or Gaussians.
+Fused in the compiled kernel. SSIM as 3DGS defines it (`graings.constants`): per channel, with a Gaussian window and
+zero padding; local variances are clamped at 0 and local values to [-1, 1], with zero gradient where clamped. Meant for
+losses; evaluation uses `graings.evaluation.metrics`, which rounds to 8 bits first.
 """
 
 from __future__ import annotations
@@ -10,32 +10,40 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from graings import kernel
 
 
-def ssim(image: Tensor, target: Tensor, *, threads: int | None = None) -> Tensor:
-    """Mean SSIM over pixels and channels of two [H, W, 3] images in [0, 1]; a scalar in [-1, 1].
+def ssim(
+    image: Float[Tensor, "height width 3"], target: Float[Tensor, "height width 3"], *, threads: int | None = None
+) -> Float[Tensor, ""]:
+    """Mean SSIM over pixels and channels of two images in [0, 1]; a scalar in [-1, 1].
 
     Differentiable with respect to `image` only. Raises `ValueError` for a wrong shape, dtype or device and for a
     `target` that requires a gradient.
     """
-    return _mixture(image, target, 1.0, 0.0, 0.0, threads)
+    return _weighted_sum(image, target, 1.0, 0.0, 0.0, threads)
 
 
 def photometric(
-    image: Tensor, target: Tensor, ssim_weight: float, squared_weight: float = 0.0, *, threads: int | None = None
-) -> Tensor:
+    image: Float[Tensor, "height width 3"],
+    target: Float[Tensor, "height width 3"],
+    ssim_weight: float,
+    squared_weight: float = 0.0,
+    *,
+    threads: int | None = None,
+) -> Float[Tensor, ""]:
     """(1 - w) |image - target|_1 + w (1 - SSIM) + q (image - target)^2, means over pixels and channels.
 
     w is `ssim_weight`, q `squared_weight`; without q it is Eq. 15. Arguments and errors are those of `ssim`.
     """
-    return ssim_weight + _mixture(image, target, -ssim_weight, 1.0 - ssim_weight, squared_weight, threads)
+    return ssim_weight + _weighted_sum(image, target, -ssim_weight, 1.0 - ssim_weight, squared_weight, threads)
 
 
-def _mixture(
+def _weighted_sum(
     image: Tensor, target: Tensor, similarity: float, absolute: float, squared: float, threads: int | None
 ) -> Tensor:
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
@@ -52,11 +60,11 @@ def _mixture(
         raise ValueError(f"threads must be at least 1, got {threads}")
     workers = kernel.thread_count() if threads is None else threads
     weights = (similarity, absolute, squared)
-    value: Tensor = _Comparison.apply(image, target, weights, workers)  # type: ignore[no-untyped-call]
+    value: Tensor = _Photometric.apply(image, target, weights, workers)  # type: ignore[no-untyped-call]
     return value
 
 
-class _Comparison(torch.autograd.Function):
+class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, weights: tuple[float, float, float], threads: int) -> Tensor:
         first, second = image.detach().contiguous(), target.detach().contiguous()

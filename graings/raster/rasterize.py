@@ -1,7 +1,7 @@
-"""The picture of Gaussians, drawn by the compiled kernel.
+"""rasterize: the image of a batch of Gaussians, drawn by the compiled kernel.
 
-The torch side only: checks, buffers and autograd. What is drawn is defined by `graings.raster.reference`,
-with which the kernel agrees. Knows nothing of scenes, losses or files.
+This is the torch side only: checks, buffers and autograd. `graings.raster.reference` defines the image, and tests
+compare the kernel with it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -23,22 +24,21 @@ from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 def rasterize(
     gaussians: Gaussians,
     camera: Camera,
-    background: Tensor,
+    background: Float[Tensor, " 3"],
     *,
-    means2d_offset: Tensor | None = None,
+    means2d_offset: Float[Tensor, "gaussian 2"] | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
     depth: bool = True,
     threads: int | None = None,
 ) -> RenderResult:
-    """Draw `gaussians` seen by `camera` on `background` [3] (RGB, same dtype); Eq. (1) and (2).
+    """Draw `gaussians` seen by `camera` on `background` (RGB, same dtype); Eq. (1) and (2).
 
-    `means2d_offset` [N, 2] is added to the projected centres (pixels): pass zeros that require a gradient to
-    learn the gradient in screen space. A Gaussian that is not drawn receives a gradient of exactly zero.
-    Without `depth` the result has None there. `threads` is the number of CPU threads (None: the kernel's default); the
-    result has the same bits for any number. Pixels are computed in the dtype of the Gaussians, geometry always
-    in float64.
+    `means2d_offset` is added to the projected centres (pixels): pass zeros that require a gradient to obtain the
+    gradient in screen space. A Gaussian that is not drawn receives a gradient of exactly zero. With `depth` False
+    the result's depth is None. `threads` is the number of CPU threads (None: the kernel's default); the result has
+    the same bits for any number. Pixels are computed in the dtype of the Gaussians, geometry always in float64.
 
-    What the gradient needs is given back once it has been computed: a second one, of a retained graph, draws again.
+    The backward pass frees the memory it needed: a second one through a retained graph draws the image again.
 
     Raises `ValueError` for a wrong shape, dtype or device, `KernelError` when the kernel is not built.
     """
@@ -60,11 +60,11 @@ def rasterize(
     return RenderResult(*images, frame.culled)
 
 
-Images = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]  # of a `RenderResult`, in its order
+Images = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]  # color, alpha, depth, means2d, radii
 
 
 def _prepared(tensor: Tensor | None) -> Tensor | None:
-    """As the kernel takes it: one number after the other in memory, with its sign."""
+    """Contiguous memory with resolved signs, as the kernel reads it."""
     if tensor is None:
         return None
     if tensor._is_zerotensor():  # autograd's zeros have no memory
@@ -73,7 +73,7 @@ def _prepared(tensor: Tensor | None) -> Tensor | None:
 
 
 def _addresses(*tensors: Tensor | None) -> list[int]:
-    """Where the numbers of prepared tensors lie, for the kernel; 0: nowhere."""
+    """Memory addresses of prepared tensors; 0 for None."""
     return [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
@@ -86,9 +86,9 @@ def _draw(
     *,
     gradient: bool,
 ) -> tuple[Any, Images]:
-    """The kernel's frame, which keeps what a `gradient` needs, and the images.
+    """The kernel's frame, which with `gradient` keeps what the backward pass needs, and the images.
 
-    `inputs` are prepared: means, quats, log_scales, opacities, colors, background, offset or None, uids.
+    `inputs` are prepared tensors: means, quats, log_scales, opacities, colors, background, offset or None, uids.
     """
     means = inputs[0]
     assert means is not None
@@ -145,22 +145,22 @@ class _Rasterize(torch.autograd.Function):
     def backward(
         ctx: Any, v_color: Tensor | None, v_alpha: Tensor | None, v_depth: Tensor | None, *_: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        nothing: tuple[None, ...] = (None,) * 12
         if v_color is None and v_alpha is None and v_depth is None:
-            return nothing
-        means, quats, log_scales, opacities, colors, ground, shift, _ = ctx.saved_tensors
+            return (None,) * 12
+        means, quats, log_scales, opacities, colors, background, offset, _ = ctx.saved_tensors
         inputs = (means, quats, log_scales, opacities, colors)
         camera, settings = ctx.view
-        # A frame has one gradient to give. Of a retained graph, who comes second or at the same time draws again.
+        # A frame serves one backward pass. A second or concurrent one through a retained graph draws again.
         frame = ctx.__dict__.pop("frame", None)
         if frame is None:
             frame, _ = _draw(ctx.saved_tensors, camera, settings, False, ctx.threads, gradient=True)
         upstream = means.new_zeros(camera.height, camera.width, 3) if v_color is None else v_color
         upstreams = [_prepared(v) for v in (upstream, v_alpha, v_depth)]
-        v_ground = torch.empty_like(ground) if ctx.needs_input_grad[len(inputs)] else None
-        frame.pixels_gradient(*_addresses(ground, *upstreams, v_ground), ctx.threads)
-        # only now: they find room where the frame kept what it has given back
+        v_background = torch.empty_like(background) if ctx.needs_input_grad[len(inputs)] else None
+        frame.pixels_gradient(*_addresses(background, *upstreams, v_background), ctx.threads)
+        # Allocated only now, because pixels_gradient has freed memory of the frame that they can reuse.
         gradients = [torch.empty_like(tensor) for tensor in inputs]
-        v_shift = None if shift is None else torch.empty_like(shift)
-        frame.gaussians_gradient(len(means), *_addresses(*inputs, ground, shift, *gradients, v_shift), ctx.threads)
-        return (*gradients, v_ground, v_shift, None, None, None, None, None)
+        v_offset = None if offset is None else torch.empty_like(offset)
+        addresses = _addresses(*inputs, background, offset, *gradients, v_offset)
+        frame.gaussians_gradient(len(means), *addresses, ctx.threads)
+        return (*gradients, v_background, v_offset, None, None, None, None, None)

@@ -1,8 +1,7 @@
-"""The oracle: the picture by brute force, in plain torch.
+"""The slow reference rasterizer (oracle): brute force in plain torch.
 
-Every Gaussian is evaluated at every pixel, in float64, and autograd takes the derivative. It is slow and
-obviously right; the kernel must agree with it. Culling, order and stopping are those of the kernel because
-both follow the same rules, not because they share code. Knows nothing of threads or instruction sets.
+Every Gaussian is evaluated at every pixel, in float64, and autograd takes the derivative. Tests compare the kernel with
+it. It shares no code with the kernel: both follow the same rules of culling, order and stopping.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
@@ -21,10 +21,10 @@ from graings.gaussians import Gaussians
 from graings.raster.arguments import check_arguments
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 
-# Elements of one [pixel, gaussian] matrix: a dozen of them in float64 live at once, about 100 MB.
+# Elements of one [pixel, gaussian] matrix. About a dozen such float64 matrices exist at once: 100 MB.
 CHUNK_ELEMENTS = 1 << 20
 
-# Below this squared norm a quaternion has no direction left in float32.
+# Below this squared norm the direction of a float32 quaternion is not defined.
 MIN_SQUARED_QUAT = 1e-24
 
 
@@ -47,21 +47,21 @@ class _Footprints:
 def rasterize(
     gaussians: Gaussians,
     camera: Camera,
-    background: Tensor,
+    background: Float[Tensor, " 3"],
     *,
-    means2d_offset: Tensor | None = None,
+    means2d_offset: Float[Tensor, "gaussian 2"] | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
     depth: bool = True,
     threads: int | None = None,
 ) -> RenderResult:
-    """Draw `gaussians` seen by `camera` on `background` [3]; same contract as `graings.raster.rasterize`.
+    """Draw `gaussians` seen by `camera` on `background`; same contract as `graings.raster.rasterize.rasterize`.
 
     `threads` is accepted for the common signature and ignored.
     """
     check_arguments(gaussians, background, means2d_offset, threads)
     dtype, n = gaussians.means.dtype, len(gaussians)
     means, quats, log_scales = gaussians.means.double(), gaussians.quats.double(), gaussians.log_scales.double()
-    opacities, colors, ground = gaussians.opacities.double(), gaussians.colors.double(), background.double()
+    opacities, colors, behind = gaussians.opacities.double(), gaussians.colors.double(), background.double()
     offset = torch.zeros(n, 2, dtype=torch.float64) if means2d_offset is None else means2d_offset.double()
 
     with torch.no_grad():
@@ -70,14 +70,14 @@ def rasterize(
         by_uid = torch.argsort(gaussians.uids[drawn], stable=True)
         drawn = drawn[by_uid][torch.argsort(z[by_uid], stable=True)]
 
-    prints = _project(means[drawn], quats[drawn], log_scales[drawn], offset[drawn], camera, settings)
+    footprints = _project(means[drawn], quats[drawn], log_scales[drawn], offset[drawn], camera, settings)
     pixels = _pixel_centres(camera)
     size = max(1, CHUNK_ELEMENTS // max(1, len(drawn)))
     parts = [
         cast(
             Tensor,
             checkpoint(
-                _composite, chunk, prints, opacities[drawn], colors[drawn], ground, settings, use_reentrant=False
+                _composite, chunk, footprints, opacities[drawn], colors[drawn], behind, settings, use_reentrant=False
             ),
         )
         for chunk in pixels.split(size)
@@ -85,8 +85,10 @@ def rasterize(
     image = torch.cat(parts).reshape(camera.height, camera.width, 5).to(dtype)
 
     with torch.no_grad():
-        means2d = torch.zeros(n, 2, dtype=torch.float64).index_copy(0, drawn, prints.means2d)
-        radii = torch.zeros(n, 2, dtype=torch.float64).index_copy(0, drawn, _radii(prints, opacities[drawn], settings))
+        means2d = torch.zeros(n, 2, dtype=torch.float64).index_copy(0, drawn, footprints.means2d)
+        radii = torch.zeros(n, 2, dtype=torch.float64).index_copy(
+            0, drawn, _radii(footprints, opacities[drawn], settings)
+        )
     drawn_depth = image[..., 4] if depth else None
     return RenderResult(image[..., :3], image[..., 3], drawn_depth, means2d.to(dtype), radii.to(dtype), culled)
 
@@ -101,31 +103,33 @@ def _cull(
     camera: Camera,
     settings: RasterSettings,
 ) -> tuple[Tensor, dict[str, int]]:
-    """Indices of what is drawn and the reasons for the rest; each Gaussian is counted at its first reason."""
+    """Indices of the drawn Gaussians, and how many were culled by reason; each counts for its first reason."""
     everything = torch.cat([means, quats, log_scales, opacities[:, None], colors, offset], 1)
     squared = (quats * quats).sum(1)
     largest = torch.cat([log_scales.exp(), _in_camera(means, camera)[:, 2:].abs()], 1).amax(1)
     finite = everything.isfinite().all(1) & squared.isfinite() & (largest <= settings.far)
-    turned = squared >= MIN_SQUARED_QUAT
+    has_direction = squared >= MIN_SQUARED_QUAT
     in_front = _in_camera(means, camera)[:, 2] > settings.near
     visible = opacities > settings.alpha_min
-    alive = (finite & turned & in_front & visible).nonzero()[:, 0]
+    candidates = (finite & has_direction & in_front & visible).nonzero()[:, 0]
 
-    prints = _project(means[alive], quats[alive], log_scales[alive], offset[alive], camera, settings)
-    bounded = prints.finite()
-    inside = _touches_image(prints, opacities[alive], camera, settings)
+    footprints = _project(
+        means[candidates], quats[candidates], log_scales[candidates], offset[candidates], camera, settings
+    )
+    bounded = footprints.finite()
+    inside = _touches_image(footprints, opacities[candidates], camera, settings)
     culled = {
         "non_finite": int((~finite).sum() + (~bounded).sum()),
-        "zero_quat": int((finite & ~turned).sum()),
-        "behind": int((finite & turned & ~in_front).sum()),
-        "faint": int((finite & turned & in_front & ~visible).sum()),
+        "zero_quat": int((finite & ~has_direction).sum()),
+        "behind": int((finite & has_direction & ~in_front).sum()),
+        "faint": int((finite & has_direction & in_front & ~visible).sum()),
         "outside": int((bounded & ~inside).sum()),
     }
-    return alive[bounded & inside], culled
+    return candidates[bounded & inside], culled
 
 
 def _in_camera(means: Tensor, camera: Camera) -> Tensor:
-    """Rw (x - centre): the difference first, so that a far-off scene does not cancel."""
+    """Rw (x - centre): the difference comes first, to avoid cancellation far from the world's origin."""
     pose = torch.tensor(camera.world_to_camera)
     return (means - torch.tensor(camera.center)) @ pose[:3, :3].T
 
@@ -144,7 +148,7 @@ def _rotations(quats: Tensor) -> Tensor:
 def _project(
     means: Tensor, quats: Tensor, log_scales: Tensor, offset: Tensor, camera: Camera, settings: RasterSettings
 ) -> _Footprints:
-    """EWA projection in sheared form: no inverse, and a determinant without a subtraction."""
+    """EWA projection as a sheared footprint: no matrix inverse, and a determinant without a subtraction."""
     x, y, z = _in_camera(means, camera).unbind(1)
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     rx, ry = x / z, y / z
@@ -159,41 +163,41 @@ def _project(
     factor = jacobian @ world_to_camera @ _rotations(quats) * log_scales.exp()[:, None, :]  # covariance = F F^T
     m1, m2 = factor.unbind(1)
     xx, yy, xy = (m1 * m1).sum(1), (m2 * m2).sum(1), (m1 * m2).sum(1)
-    across = torch.linalg.cross(m1, m2)
+    cross = torch.linalg.cross(m1, m2)
     h = settings.blur
     c = yy + h
-    determinant = h * h + h * (xx + yy) + (across * across).sum(1)  # Lagrange's identity
+    determinant = h * h + h * (xx + yy) + (cross * cross).sum(1)  # Lagrange's identity
     means2d = torch.stack([fx * rx + cx, fy * ry + cy], 1) + offset
     return _Footprints(means2d, xy / c, determinant / c, c, xx + h, z)
 
 
-def _radii(prints: _Footprints, opacities: Tensor, settings: RasterSettings) -> Tensor:
-    """Half-widths [n, 2] in px of the box beyond which alpha < alpha_min; compat: of the 3-sigma square."""
+def _radii(footprints: _Footprints, opacities: Tensor, settings: RasterSettings) -> Tensor:
+    """Half-widths [n, 2] in px of the box outside which alpha < alpha_min; compat: of the 3-sigma square."""
     if settings.compat:
-        covariance = prints.slope * prints.c
-        mean, half = 0.5 * (prints.a + prints.c), 0.5 * (prints.a - prints.c)
+        covariance = footprints.slope * footprints.c
+        mean, half = 0.5 * (footprints.a + footprints.c), 0.5 * (footprints.a - footprints.c)
         largest = mean + torch.hypot(half, covariance)
         return (3 * largest.sqrt()).ceil()[:, None].expand(-1, 2)
     if settings.alpha_min == 0:
         return torch.full((len(opacities), 2), math.inf, dtype=torch.float64)
     level = 2 * (opacities / settings.alpha_min).log()
-    return (level[:, None] * torch.stack([prints.a, prints.c], 1)).sqrt()
+    return (level[:, None] * torch.stack([footprints.a, footprints.c], 1)).sqrt()
 
 
-def _tile_range(prints: _Footprints, radii: Tensor) -> tuple[Tensor, Tensor]:
-    """compat: first and one-past-last tile touched by the square, as the public rasterizers count them."""
-    return ((prints.means2d - radii) / TILE).floor(), ((prints.means2d + radii) / TILE).ceil()
+def _tile_range(footprints: _Footprints, radii: Tensor) -> tuple[Tensor, Tensor]:
+    """compat: first and one-past-last tile that the square touches, as public rasterizers count them."""
+    return ((footprints.means2d - radii) / TILE).floor(), ((footprints.means2d + radii) / TILE).ceil()
 
 
-def _touches_image(prints: _Footprints, opacities: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
+def _touches_image(footprints: _Footprints, opacities: Tensor, camera: Camera, settings: RasterSettings) -> Tensor:
     """Whether the footprint reaches a pixel centre, with a pixel of slack on each side."""
-    radii = _radii(prints, opacities, settings)
+    radii = _radii(footprints, opacities, settings)
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
     if settings.compat:
-        first, last = _tile_range(prints, radii)
+        first, last = _tile_range(footprints, radii)
         tiles = (size / TILE).ceil()
         return (first.clamp(min=0) < torch.minimum(last, tiles)).all(1)
-    low, high = prints.means2d - radii, prints.means2d + radii
+    low, high = footprints.means2d - radii, footprints.means2d + radii
     return ((low <= size + 0.5) & (high >= -0.5)).all(1)
 
 
@@ -204,24 +208,31 @@ def _pixel_centres(camera: Camera) -> Tensor:
 
 
 def _composite(
-    pixels: Tensor, prints: _Footprints, opacities: Tensor, colors: Tensor, ground: Tensor, settings: RasterSettings
+    pixels: Tensor,
+    footprints: _Footprints,
+    opacities: Tensor,
+    colors: Tensor,
+    background: Tensor,
+    settings: RasterSettings,
 ) -> Tensor:
     """Front to back over Gaussians in order, [pixel, 5]: colour, alpha, depth."""
-    dx, dy = (pixels[:, None, :] - prints.means2d).unbind(2)
-    r = dx - prints.slope * dy
-    raw = opacities * torch.exp(-(r * r / (2 * prints.v) + dy * dy / (2 * prints.c)))
+    dx, dy = (pixels[:, None, :] - footprints.means2d).unbind(2)
+    sheared = dx - footprints.slope * dy
+    raw = opacities * torch.exp(-(sheared * sheared / (2 * footprints.v) + dy * dy / (2 * footprints.c)))
     counts = raw >= settings.alpha_min
     if settings.compat:
-        first, last = _tile_range(prints, _radii(prints, opacities, settings))
+        first, last = _tile_range(footprints, _radii(footprints, opacities, settings))
         tile = (pixels / TILE).floor()[:, None, :]
         counts = counts & ((tile >= first) & (tile < last)).all(2)
     alpha = torch.where(counts, raw.clamp(max=settings.alpha_max), 0.0)
-    one = torch.ones(len(pixels), 1, dtype=torch.float64)
+    ones = torch.ones(len(pixels), 1, dtype=torch.float64)
     with torch.no_grad():
-        through = torch.cat([one, 1 - alpha], 1).cumprod(1)
-        tested = through[:, 1:] if settings.compat else through[:, :-1]
+        transmittance = torch.cat([ones, 1 - alpha], 1).cumprod(1)
+        tested = transmittance[:, 1:] if settings.compat else transmittance[:, :-1]
         blended = tested >= settings.transmittance_min
     alpha = torch.where(blended, alpha, 0.0)
-    through = torch.cat([one, 1 - alpha], 1).cumprod(1)
-    weights, left = alpha * through[:, :-1], through[:, -1:]
-    return torch.cat([weights @ colors + left * ground, 1 - left, weights @ prints.depths[:, None]], 1)
+    transmittance = torch.cat([ones, 1 - alpha], 1).cumprod(1)
+    weights, remaining = alpha * transmittance[:, :-1], transmittance[:, -1:]
+    return torch.cat(
+        [weights @ colors + remaining * background, 1 - remaining, weights @ footprints.depths[:, None]], 1
+    )

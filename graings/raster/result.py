@@ -1,7 +1,4 @@
-"""RenderResult and RasterSettings: what comes out of a rasterizer, and the constants of the call.
-
-Shared by the kernel and its oracle. Knows nothing of how either works.
-"""
+"""RenderResult and RasterSettings: the output of a rasterizer, and the constants of the call."""
 
 from __future__ import annotations
 
@@ -15,14 +12,14 @@ from graings import constants
 
 @dataclass(frozen=True, slots=True)
 class RasterSettings:
-    """Constants of one call; the defaults define the picture (`graings.constants`).
+    """Constants of one call; the defaults define the image (`graings.constants`).
 
-    `alpha_min = transmittance_min = 0` is the untruncated sum of Eq. (2), but for light below 1e-30 (1e-290 in
-    double), which no sum can see. `compat` is for comparison with public rasterizers only: exclusive stop (the
-    Gaussian that would cross the line is not blended) and the square footprint of three standard deviations.
+    `alpha_min = transmittance_min = 0` is the untruncated sum of Eq. (2), except for transmittances below 1e-30
+    (1e-290 in double), which do not change any sum. `compat` is for comparison with public rasterizers only: exclusive
+    stop (the Gaussian that would cross the threshold is not blended) and a square footprint of three standard
+    deviations.
 
-    Raises `ValueError` for what no picture can be drawn with; `alpha_max` is below 1 because the gradient goes back
-    through 1 - alpha.
+    Raises `ValueError` for values out of range; `alpha_max` is below 1 because the backward pass divides by 1 - alpha.
     """
 
     alpha_min: float = constants.ALPHA_MIN
@@ -53,8 +50,8 @@ class RenderResult:
     """One rendered view; images are [height, width, ...] in the dtype of the Gaussians.
 
     `depth` is the blended sum of w_i Z_i (normalised units, 0 where nothing is drawn; divide by `alpha` for
-    the expected depth), None where it was not asked for. `means2d` [N, 2] in pixels and `radii` [N, 2] (half-widths of
-    the footprint in pixels, 0 = not drawn) carry no gradient.
+    the expected depth), or None if it was not requested. `means2d` (pixels) and `radii` (half-widths of the footprint
+    in pixels, 0 = not drawn) carry no gradient.
     """
 
     color: Float[Tensor, "height width 3"]

@@ -22,7 +22,7 @@ from graings import kernel
 from graings.camera.camera import View
 from graings.capture.capture import Split
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings
-from graings.render import draw, picture
+from graings.render import draw, render_composition
 from graings.report.machine import machine_facts, version_facts
 from graings.report.work_precision import pareto
 from graings.report.work_precision_document import (
@@ -142,7 +142,7 @@ class _Frame:
         if scale != 1.0:
             camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
         raster = replace(DEFAULT_SETTINGS, alpha_min=setting.alpha_min, transmittance_min=setting.transmittance_min)
-        return picture(self.composition, camera, model.background, settings=raster).color
+        return render_composition(self.composition, camera, model.background, settings=raster).color
 
 
 def _views(model: Model, count: int, seconds: float) -> tuple[Split, tuple[View, ...]]:

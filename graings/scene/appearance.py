@@ -125,7 +125,10 @@ class ResidualField(TemporalHead):
         )
 
     def forward(
-        self, features: Float[Tensor, "anchor feature"], time: Float[Tensor, 1], directions: Float[Tensor, "anchor 3"]
+        self,
+        features: Float[Tensor, "anchor feature"],
+        time: Float[Tensor, " 1"],
+        directions: Float[Tensor, "anchor 3"],
     ) -> Float[Tensor, "anchor child 4"]:
         """(Delta c, Delta o) of every slot at `time` in [0, 1], before the bound eta tanh of Eq. 12."""
         encoded_time = frequency_encoding(time, self.time_frequencies)

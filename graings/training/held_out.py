@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.evaluation.metrics import Lpips, SplitMetrics, measure_split
-from graings.render import picture
+from graings.render import render_composition
 from graings.scene.scene import Scene
 from graings.training.guard.stiffness import SubpixelCounter
 
@@ -46,7 +46,7 @@ class HeldOut:
                 started = time.perf_counter()
                 with torch.inference_mode():
                     composition = scene.compose(frame.camera.center, frame.time)
-                    result = picture(composition, frame.camera, background)
+                    result = render_composition(composition, frame.camera, background)
                 seconds.append(time.perf_counter() - started)
                 footprints.add(composition, result.radii, frame.camera)
                 yield frame.name, frame.time, result.color.clamp(0, 1).numpy(), images.rgb(frame)

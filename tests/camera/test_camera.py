@@ -1,4 +1,4 @@
-"""A camera's pose is a rotation to the last bit, and stays as it is once it is one."""
+"""A camera's rotation is exact to rounding, and an exact one keeps its bits."""
 
 from __future__ import annotations
 

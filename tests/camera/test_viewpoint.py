@@ -37,13 +37,13 @@ def test_orbit_reads_radius_and_target_in_the_captures_units() -> None:
     np.testing.assert_allclose(camera.forward, (target - eye) / 8.0, atol=1e-12)
 
 
-def test_a_camera_on_the_target_counts_as_level() -> None:
+def test_a_camera_at_the_target_has_elevation_zero() -> None:
     at_center = View("c", Camera(np.eye(4), 50.0, 50.0, 20.0, 15.0, 40, 30), 0.0)
     camera = orbit_view((at_center,), UNITS, radius=4.0)
     assert abs(camera.center[2]) < 1e-12
 
 
-def test_one_length_keeps_the_shape_of_the_picture() -> None:
+def test_width_or_height_alone_keeps_the_aspect_ratio() -> None:
     camera = orbit_view(ring((0.0,), 1.0), UNITS, width=80)
     assert (camera.width, camera.height) == (80, 60)
     assert (sized(camera, height=30).width, sized(camera, height=30).height) == (40, 30)
@@ -134,6 +134,6 @@ def test_a_background_is_a_name_a_hex_code_or_three_numbers(text: str, color: tu
 
 
 @pytest.mark.parametrize("text", ["", "pink", "#fff", "#gg0000", "#+1+2+3", "1,1", "0,0,2", "nan,0,0", "0,0,0,0"])
-def test_anything_else_is_no_background(text: str) -> None:
+def test_an_invalid_background_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="background must be white"):
         background_rgb(text)

@@ -1,4 +1,4 @@
-"""What a process is set up with before it computes."""
+"""Threads and memory of a process."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import torch
 from graings.kernel import use_threads
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told to keep memory")
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can keep freed memory")
 @pytest.mark.parametrize("megabytes", [16, 80])
-def test_memory_that_a_step_frees_is_there_for_the_next(megabytes: int) -> None:
+def test_freed_memory_is_kept_for_the_next_step(megabytes: int) -> None:
     use_threads(1)
 
     def faults(rounds: int) -> int:
@@ -22,6 +22,6 @@ def test_memory_that_a_step_frees_is_there_for_the_next(megabytes: int) -> None:
             torch.ones(megabytes << 18)
         return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
-    faults(20)  # until small things lie where they do not matter
+    faults(20)  # warm-up
     pages = 5 * (megabytes << 20) // resource.getpagesize()
     assert faults(5) < pages / 20

@@ -1,4 +1,4 @@
-"""Runs a rasterizer with gradients, measures disagreement, and finds the pixels where rounding may decide."""
+"""Runs a rasterizer with gradients, measures differences, and finds pixels where rounding may decide a threshold."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Rasterizer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A picture and the gradient of every input."""
+    """An image and the gradient of every input."""
 
     result: RenderResult
     gradients: dict[str, Tensor]
@@ -78,21 +78,21 @@ def draw(
 
 
 def relative(value: Tensor, expected: Tensor) -> float:
-    """Norm of the difference over the norm of what is expected; 0 where both vanish."""
+    """Norm of the difference over the norm of `expected`; 0 if both are 0."""
     difference, size = (value.double() - expected.double()).norm().item(), expected.double().norm().item()
     return difference / size if size > 0 else difference
 
 
 @dataclass(frozen=True, slots=True)
 class Decisions:
-    """Where a rounding error could tip a decision, and how many Gaussians the deepest pixel blends."""
+    """Pixels where a rounding error could reverse a threshold decision, and the largest number of blended Gaussians."""
 
     steady: Tensor  # [H, W] bool: no contributor within 1e-4 of a threshold
     deepest: int
 
 
 def decisions(gaussians: Gaussians, camera: Camera, settings: RasterSettings = DEFAULT_SETTINGS) -> Decisions:
-    """Thresholds of alpha_min, of the stop and of the alpha cap (which only gradients feel)."""
+    """For the thresholds of alpha_min, of the stop and of the alpha cap (which affects only gradients)."""
     offset = torch.zeros(len(gaussians), 2, dtype=torch.float64)
     values = (gaussians.means, gaussians.quats, gaussians.log_scales)
     drawn, _ = reference._cull(*values, gaussians.opacities, gaussians.colors, offset, camera, settings)

@@ -1,4 +1,4 @@
-"""Writes the evidence of a session where GRAINGS_EVIDENCE names a file."""
+"""Writes the measured errors of a test session to the file named by GRAINGS_EVIDENCE."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def pytest_sessionfinish() -> None:
 
 @pytest.fixture
 def dirty_memory() -> Iterator[None]:
-    """Memory comes filled with 0xFF: not a number as float or double, -1 as an integer."""
+    """Fills newly allocated memory with 0xFF: NaN as float or double, -1 as an integer."""
     if platform.libc_ver()[0] != "glibc":
-        pytest.skip("only glibc fills what it hands out")
+        pytest.skip("only glibc can fill allocated memory")
     mallopt = ctypes.CDLL(None).mallopt
     perturb = -6
     # glibc writes the complement of the lowest byte, and nothing where the whole number is 0

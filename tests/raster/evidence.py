@@ -1,4 +1,4 @@
-"""Measured errors beside the bounds they must keep: asserted where they arise, collected for `docs/numerics.md`."""
+"""Measured errors and their bounds: asserted in the tests, collected for `docs/numerics.md`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from pathlib import Path
 
 HEADER = """# Numerics of the rasterizer
 
-Written by the tests: `GRAINGS_EVIDENCE=docs/numerics.md pytest tests/raster`. Each line is the worst of all runs of a
-test, over scenes, image sizes and instruction sets. Bounds are derived, not fitted: u = 2^-24, n is the number of
-Gaussians on the deepest pixel, tau(n) = (32 + 4 sqrt n) u for images in float32 outside the pixels where rounding may
-tip a decision, 2e-5 norm-wise for gradients; float64 against the oracle is rounding alone.
+Written by the tests: `GRAINGS_EVIDENCE=docs/numerics.md pytest tests/raster`. Each line is the worst case
+of a test, over scenes, image sizes and instruction sets. The oracle is the slow reference,
+`graings/raster/reference.py`. Bounds are derived, not fitted. With u = 2^-24 and n the largest number of Gaussians
+blended into a pixel, images in float32 may differ by (32 + 4 sqrt n) u, except at pixels where rounding may reverse a
+threshold decision; gradients by 2e-5 of their norm. Differences of the float64 kernel to the oracle are rounding.
 
 | test | what | measured | bound | runs |
 |---|---|---|---|---|
@@ -31,7 +32,7 @@ _rows: dict[tuple[str, str], Row] = {}
 
 
 def within(what: str, measured: float, bound: float) -> None:
-    """Asserts that an error keeps its bound, and remembers under the running test's name how close it came."""
+    """Asserts that an error is within its bound, and records it under the name of the running test."""
     case = (
         os.environ["PYTEST_CURRENT_TEST"]
         .split("::")[-1]
@@ -48,7 +49,7 @@ def within(what: str, measured: float, bound: float) -> None:
 
 
 def write(path: Path) -> None:
-    """All cases so far as a table."""
+    """Writes all recorded cases as a table."""
     lines = [
         f"| {case} | {what} | {row.measured:.1e} | {'exact' if row.bound == 0 else f'{row.bound:.1e}'} | {row.runs} |\n"
         for (case, what), row in sorted(_rows.items())

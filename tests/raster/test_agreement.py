@@ -1,4 +1,4 @@
-"""The kernel draws what the oracle draws: in double to rounding, in single within derived bounds."""
+"""The kernel equals the oracle: in double precision to rounding, in single precision within derived bounds."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ def test_double_kernel_equals_oracle_with_other_settings(
 
 @pytest.mark.parametrize("name", SCENES)
 def test_single_precision_stays_within_its_bounds(name: str, isa: str) -> None:
-    """Against the float64 picture of the very same float32 inputs, where no decision hangs on rounding."""
+    """Compared with the float64 image of the same float32 inputs, at pixels where rounding decides no threshold."""
     batch, camera = SCENES[name]()
     single = cast(batch, torch.float32)
     exact = cast(single, torch.float64)
     choice = decisions(exact, camera)
     assert choice.steady.double().mean() > 0.5
     cotangent = upstream(camera, keep=choice.steady).float().double()
-    # alpha carries at most 30 units of roundoff and passes through once; sums over n contributors add sqrt(n)
+    # alpha has at most 30 units of roundoff; sums over n contributors add sqrt(n)
     bound = (32 + 4 * math.sqrt(choice.deepest)) * UNIT_ROUNDOFF
     ours = draw(rasterize, single, camera, cotangent)
     oracle = draw(reference.rasterize, exact, camera, cotangent)
@@ -100,11 +100,11 @@ def test_gradcheck_passes_on_the_double_kernel() -> None:
     floats = (batch.means, batch.quats, batch.log_scales, batch.opacities, batch.colors)
     offset, background = torch.zeros(6, 2, dtype=torch.float64), torch.rand(3, dtype=torch.float64)
 
-    def picture(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def render_view(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
         result = rasterize(
             type(batch)(*values[:5], batch.uids), camera, values[5], means2d_offset=values[6], settings=settings
         )
         return result.color, result.alpha, result.depth
 
     leaves = [value.clone().requires_grad_() for value in (*floats, background, offset)]
-    assert torch.autograd.gradcheck(picture, leaves, eps=1e-6, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(render_view, leaves, eps=1e-6, atol=1e-6, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""What must hold to the last bit: threads, order of rows, isolation of bad Gaussians, empty pictures."""
+"""Properties that hold to the last bit: threads, order of rows, isolation of non-finite Gaussians, empty images."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def assert_same_bits(first: Drawing, second: Drawing) -> None:
         assert torch.equal(gradient, second.gradients[name]), name
 
 
-def picture(batch: Gaussians, camera: Camera, *, settings: RasterSettings | None = None) -> RenderResult:
+def render_view(batch: Gaussians, camera: Camera, *, settings: RasterSettings | None = None) -> RenderResult:
     background = torch.tensor(BACKGROUND, dtype=batch.means.dtype)
     return rasterize(batch, camera, background, settings=settings or RasterSettings(), threads=1)
 
@@ -45,7 +45,7 @@ def test_any_number_of_threads_gives_the_same_bits(threads: int, dtype: torch.dt
         assert_same_bits(one, draw(rasterize, cast(batch, dtype), camera, upstream(camera), threads=threads))
 
 
-def test_nothing_is_carried_over_from_another_view() -> None:
+def test_no_state_is_carried_over_from_another_view() -> None:
     batch, camera = overlapping()
     first = draw(rasterize, batch, camera, upstream(camera))
     draw(rasterize, *wide(), upstream(camera))
@@ -70,30 +70,30 @@ def test_slabs_of_equal_depth_are_ordered_by_uid_not_by_row() -> None:
     grid = torch.stack([(x - 9.5) / 16, (y - 9.5) / 16, 2 + z / 16], -1).reshape(-1, 3).double()
     batch = replace(gaussians(len(grid), 22, log_scales=(-3.0, -2.0)), means=grid)
     shuffle = torch.randperm(len(grid), generator=torch.Generator().manual_seed(1))
-    first, second = picture(batch, pinhole()), picture(rows(batch, shuffle), pinhole())
+    first, second = render_view(batch, pinhole()), render_view(rows(batch, shuffle), pinhole())
     assert all(torch.equal(getattr(first, name), getattr(second, name)) for name in IMAGES)
 
 
-def test_uids_decide_who_is_in_front_at_equal_depth() -> None:
+def test_uids_decide_the_order_at_equal_depth() -> None:
     batch = gaussians(2, 23, spread=0.0, opacity=(0.9, 0.9))
     batch = replace(batch, means=batch.means[:1].repeat(2, 1), uids=torch.tensor([7, 3]))
     camera = pinhole(15, 15)
-    nearest = picture(batch, camera).color[7, 7]
-    swapped = picture(replace(batch, uids=torch.tensor([3, 7])), camera).color[7, 7]
+    nearest = render_view(batch, camera).color[7, 7]
+    swapped = render_view(replace(batch, uids=torch.tensor([3, 7])), camera).color[7, 7]
     assert (nearest - batch.colors[1]).norm() < (nearest - batch.colors[0]).norm()
     assert (swapped - batch.colors[0]).norm() < (swapped - batch.colors[1]).norm()
 
 
 def test_the_sign_of_a_quaternion_does_not_matter() -> None:
     batch, camera = overlapping()
-    first, second = picture(batch, camera), picture(replace(batch, quats=-batch.quats), camera)
+    first, second = render_view(batch, camera), render_view(replace(batch, quats=-batch.quats), camera)
     assert all(torch.equal(getattr(first, name), getattr(second, name)) for name in IMAGES)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("field", FLOATS)
-def test_a_non_finite_gaussian_is_counted_and_touches_nothing_else(field: str, bad: float, dtype: torch.dtype) -> None:
+def test_a_non_finite_gaussian_is_culled_and_affects_nothing_else(field: str, bad: float, dtype: torch.dtype) -> None:
     batch, camera = cast(overlapping()[0], dtype), overlapping()[1]
     poisoned = getattr(batch, field).clone()
     poisoned.view(len(batch), -1)[17, -1] = bad
@@ -130,13 +130,13 @@ def test_every_reason_for_culling_is_counted_once() -> None:
     opacities[3] = 1 / 255
     means[4, 0] = 1e8
     batch = replace(batch, means=means, quats=quats, opacities=opacities)
-    culled = picture(batch, pinhole()).culled
+    culled = render_view(batch, pinhole()).culled
     assert culled == {"non_finite": 1, "zero_quat": 1, "behind": 1, "faint": 1, "outside": 1}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scene", ["none", "all_behind", "all_zero_quat"])
-def test_an_empty_picture_is_the_background_with_zero_gradients(scene: str, dtype: torch.dtype) -> None:
+def test_an_empty_image_is_the_background_with_zero_gradients(scene: str, dtype: torch.dtype) -> None:
     batch = cast(gaussians(0 if scene == "none" else 5, 25), dtype)
     if scene == "all_behind":
         batch = replace(batch, means=-batch.means)
@@ -156,12 +156,12 @@ def test_an_empty_picture_is_the_background_with_zero_gradients(scene: str, dtyp
 @pytest.mark.parametrize("opacity", [-0.5, 0.0, float(np.nextafter(1 / 255, 0)), 1 / 255])
 def test_an_opacity_at_or_below_the_smallest_alpha_is_not_drawn(opacity: float) -> None:
     batch = replace(gaussians(1, 26, spread=0.0), opacities=torch.tensor([opacity], dtype=torch.float64))
-    assert picture(batch, pinhole()).culled["faint"] == 1
+    assert render_view(batch, pinhole()).culled["faint"] == 1
 
 
 def test_alpha_is_capped() -> None:
     batch = gaussians(1, 27, spread=0.0, log_scales=(0.0, 0.0), opacity=(1.1, 1.1))
-    assert picture(batch, pinhole(5, 5)).alpha.max().item() == 0.99
+    assert render_view(batch, pinhole(5, 5)).alpha.max().item() == 0.99
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -174,12 +174,12 @@ def test_one_colour_everywhere_stays_that_colour(dtype: torch.dtype) -> None:
 
 
 def test_the_last_gaussian_before_the_stop_is_blended() -> None:
-    """Inclusive stop: at most 1e-4 of the light is lost; stopping before the blend loses up to 1e-2."""
+    """Inclusive stop: at most 1e-4 of the light is missing; without the last Gaussian up to 1e-2 is."""
     batch = gaussians(4, 28, spread=0.0, depth=(2.0, 3.0), log_scales=(2.0, 2.0), opacity=(0.95, 0.95))
     camera = pinhole(3, 3)
-    untruncated = picture(batch, camera, settings=RasterSettings(transmittance_min=0.0)).alpha
-    inclusive = picture(batch, camera).alpha
-    exclusive = picture(batch, camera, settings=RasterSettings(compat=True)).alpha
+    untruncated = render_view(batch, camera, settings=RasterSettings(transmittance_min=0.0)).alpha
+    inclusive = render_view(batch, camera).alpha
+    exclusive = render_view(batch, camera, settings=RasterSettings(compat=True)).alpha
     assert (untruncated - inclusive).max().item() <= 1e-4
     assert (untruncated - exclusive).max().item() > 1e-4
 
@@ -195,24 +195,24 @@ def test_unused_outputs_need_no_gradient() -> None:
         assert gradient.abs().sum() > 0
 
 
-def test_what_torch_has_yet_to_negate_or_to_write_counts_as_what_it_says() -> None:
-    """The kernel reads memory, where a lazily negated tensor has the other sign and autograd's zeros are not."""
+def test_lazily_negated_and_zero_tensors_are_resolved() -> None:
+    """The kernel reads memory, where a lazily negated tensor has the wrong sign and a zero tensor has no data."""
     batch, camera = gaussians(50, 30), pinhole()
     means = batch.means.clone().requires_grad_()
-    color = picture(replace(batch, means=means), camera).color
-    assert torch.equal(picture(replace(batch, means=torch._neg_view(-batch.means)), camera).color, color)
+    color = render_view(replace(batch, means=means), camera).color
+    assert torch.equal(render_view(replace(batch, means=torch._neg_view(-batch.means)), camera).color, color)
     cotangent = upstream(camera)[..., :3]
     (expected,) = torch.autograd.grad(color, means, cotangent, retain_graph=True)
     (negated,) = torch.autograd.grad(color, means, torch._neg_view(-cotangent), retain_graph=True)
     assert torch.equal(expected, negated)
     assert expected.abs().amax() > 0
-    (silent,) = torch.autograd.grad(color, means, torch._efficientzerotensor(color.shape, dtype=color.dtype))
-    assert (silent == 0).all()
+    (zero,) = torch.autograd.grad(color, means, torch._efficientzerotensor(color.shape, dtype=color.dtype))
+    assert (zero == 0).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_retained_graph_gives_every_gradient_as_if_it_were_the_first(dtype: torch.dtype) -> None:
-    """What the kernel keeps for a gradient goes when it has been asked for; for a second one it draws again."""
+def test_a_retained_graph_gives_the_same_gradient_every_time(dtype: torch.dtype) -> None:
+    """The first backward pass frees the state of the forward pass; a second one draws the image again."""
     batch, camera = cast(gaussians(50, 31), dtype), pinhole()
     leaves = {name: getattr(batch, name).clone().requires_grad_() for name in FLOATS}
     background = torch.tensor(BACKGROUND, dtype=dtype).requires_grad_()
@@ -236,7 +236,7 @@ def test_a_retained_graph_gives_every_gradient_as_if_it_were_the_first(dtype: to
             assert first.abs().sum() > 0
 
 
-def test_threads_that_ask_one_graph_at_once_all_get_its_gradient() -> None:
+def test_threads_that_differentiate_one_graph_concurrently_get_the_same_gradient() -> None:
     batch, camera = cast(gaussians(2_000, 32), torch.float32), pinhole()
     leaves = {name: getattr(batch, name).clone().requires_grad_() for name in FLOATS}
     color = rasterize(replace(batch, **leaves), camera, torch.tensor(BACKGROUND)).color
@@ -246,10 +246,10 @@ def test_threads_that_ask_one_graph_at_once_all_get_its_gradient() -> None:
         return torch.autograd.grad(color, list(leaves.values()), cotangent, retain_graph=True)
 
     with ThreadPoolExecutor(4) as pool:
-        found = [asked.result() for asked in [pool.submit(gradients) for _ in range(40)]]
-    for name, *answers in zip(leaves, *found, strict=True):
-        assert answers[0].abs().sum() > 0, name
-        assert all(torch.equal(answer, answers[0]) for answer in answers[1:]), name
+        results = [future.result() for future in [pool.submit(gradients) for _ in range(40)]]
+    for name, *copies in zip(leaves, *results, strict=True):
+        assert copies[0].abs().sum() > 0, name
+        assert all(torch.equal(copy, copies[0]) for copy in copies[1:]), name
 
 
 def test_drawing_works_in_inference_mode() -> None:
@@ -269,7 +269,7 @@ def test_drawing_works_in_inference_mode() -> None:
         ({"threads": 0}, "threads must be at least 1, got 0"),
     ],
 )
-def test_misuse_is_named(arguments: dict[str, object], message: str) -> None:
+def test_misuse_is_refused_by_name(arguments: dict[str, object], message: str) -> None:
     batch, camera = overlapping()
     background: Tensor = torch.ones(3, dtype=torch.float64)
     with pytest.raises(ValueError, match=message):

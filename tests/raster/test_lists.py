@@ -1,4 +1,4 @@
-"""Lists of tiles, blocks and entries only save work: what they leave out shows nowhere."""
+"""Lists of tiles, blocks and entries only save work: leaving out entries does not change the image."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tests.raster.comparison import draw, relative, upstream
 from tests.scenes import cast, gaussians, pinhole, rows
 
 
-def test_the_least_difference_of_depth_decides_before_uids() -> None:
-    """Depths a billionth apart share their sorting key where others are far away."""
+def test_the_smallest_difference_of_depth_takes_precedence_over_uids() -> None:
+    """Depths a billionth apart have the same sorting key if other Gaussians are far away."""
     batch = gaussians(3, 29, spread=0.0, opacity=(0.9, 0.9))
     means = torch.tensor([[0.0, 0.0, 2 + 1e-9], [0.0, 0.0, 2.0], [0.0, 0.0, 1e6]], dtype=torch.float64)
     batch = replace(batch, means=means, uids=torch.arange(3))
@@ -43,12 +43,12 @@ def crowds() -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("crowd", crowds())
-def test_depths_are_in_order_however_they_crowd(crowd: str, isa: str) -> None:
-    """The sort looks at leading bits first, and some depths agree in them."""
+def test_gaussians_are_sorted_by_depth_for_any_distribution_of_crowded_depths(crowd: str, isa: str) -> None:
+    """The sort compares leading bits first, in which some depths agree."""
     depths, camera = crowds()[crowd], pinhole(40, 20)
     batch = gaussians(len(depths), 74, spread=0.4, log_scales=(-1.5, -0.5), opacity=(0.01, 0.03))
     aside = batch.means[:, :2] / batch.means[:, 2:] * depths[:, None]
-    scales = batch.log_scales + (depths / 2).log()[:, None]  # of one size in the picture
+    scales = batch.log_scales + (depths / 2).log()[:, None]  # the same size in the image
     batch = replace(batch, means=torch.cat([aside, depths[:, None]], 1), log_scales=scales)
     background = torch.zeros(3, dtype=torch.float64)
     ours = rasterize(batch, camera, background, threads=2)
@@ -57,22 +57,22 @@ def test_depths_are_in_order_however_they_crowd(crowd: str, isa: str) -> None:
     torch.testing.assert_close(ours.color, oracle.color, rtol=0, atol=1e-12)
 
 
-def test_without_depth_the_rest_keeps_its_bits(isa: str) -> None:
+def test_other_outputs_have_the_same_bits_without_depth(isa: str) -> None:
     batch, camera = gaussians(300, 75, log_scales=(-3.0, -1.0)), pinhole(50, 40)
     for dtype in (torch.float32, torch.float64):
-        pictures = []
+        images = []
         for depth in (True, False):
             leaf = batch.means.to(dtype).requires_grad_()
             result = rasterize(
                 replace(cast(batch, dtype), means=leaf), camera, torch.ones(3, dtype=dtype), depth=depth, threads=2
             )
             (result.color.square().sum() + result.alpha.square().sum()).backward()
-            pictures.append((result.color, result.alpha, result.means2d, result.radii, leaf.grad))
+            images.append((result.color, result.alpha, result.means2d, result.radii, leaf.grad))
             assert (result.depth is not None) == depth
-        assert all(torch.equal(first, second) for first, second in zip(*pictures, strict=True))
+        assert all(torch.equal(first, second) for first, second in zip(*images, strict=True))
 
 
-def test_an_image_too_long_for_16_bits_of_blocks_is_refused() -> None:
+def test_an_image_with_more_blocks_than_16_bits_count_is_refused() -> None:
     batch, background = gaussians(3, 76), torch.zeros(3, dtype=torch.float64)
     for width, height in ((1, 262145), (262145, 1)):
         with pytest.raises(ValueError, match="at most 262144 pixels"):
@@ -81,8 +81,8 @@ def test_an_image_too_long_for_16_bits_of_blocks_is_refused() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("length", [1e0, 1e1, 1e2, 1e3, 1e4, 1e5])
-def test_only_the_pixel_decides_where_a_footprint_ends(length: float, dtype: torch.dtype, isa: str) -> None:
-    """Lists of tiles and blocks only save work: what is drawn is what is at least alpha_min with no list at all."""
+def test_lists_of_tiles_and_blocks_never_cut_a_footprint(length: float, dtype: torch.dtype, isa: str) -> None:
+    """The image equals the one without lists, thresholded at alpha_min."""
     camera = pinhole(200, 150, focal=100.0)
     batch = gaussians(40, 70, spread=0.8, depth=(2.0, 2.0), opacity=(0.02, 0.9))
     scales = torch.tensor([1.0, 1e-6, 1e-3], dtype=torch.float64) * length * 2.0 / camera.fx
@@ -101,7 +101,7 @@ def test_only_the_pixel_decides_where_a_footprint_ends(length: float, dtype: tor
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_memory_held_before_does_not_show_behind_the_stop_nor_in_silence(
+def test_previous_memory_contents_do_not_matter_behind_the_stop_or_without_upstream_gradient(
     dtype: torch.dtype, dirty_memory: None
 ) -> None:
     """Entries that no pixel reached, and tiles without an upstream, have no sums that could be read."""
@@ -114,8 +114,8 @@ def test_what_memory_held_before_does_not_show_behind_the_stop_nor_in_silence(
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_line_that_meets_blocks_in_their_corners_only_is_drawn_there(dtype: torch.dtype, isa: str) -> None:
-    """A needle thinner than rounding, along the diagonal: only the slack keeps blocks it meets in one corner."""
+def test_a_line_through_the_corners_of_blocks_is_drawn(dtype: torch.dtype, isa: str) -> None:
+    """A needle thinner than rounding, along the diagonal: only the slack keeps blocks that it touches at one corner."""
     camera = pinhole(64, 64, focal=128.0)
     random = torch.Generator().manual_seed(72)
     background = torch.zeros(3, dtype=dtype)
@@ -145,19 +145,19 @@ def test_a_line_that_meets_blocks_in_their_corners_only_is_drawn_there(dtype: to
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("period", [8, 16, 32, 64])
-def test_gaussians_that_silent_ones_lie_between_keep_their_gradients(period: int, dtype: torch.dtype, isa: str) -> None:
-    """One in `period` lies where the loss looks: however many entries are passed over, what waits is not lost."""
+def test_gaussians_between_inactive_ones_keep_their_gradients(period: int, dtype: torch.dtype, isa: str) -> None:
+    """One Gaussian in `period` has an upstream gradient; skipped entries in between must not overwrite its data."""
     count = 5 * period
-    heard = torch.arange(count) % period == 0
+    active = torch.arange(count) % period == 0
     batch, camera = gaussians(count, 77, log_scales=(-3.5, -3.2), opacity=(0.1, 0.3)), pinhole(16, 16)
     depths = torch.linspace(2.0, 2.5, count, dtype=torch.float64)
-    aside = torch.where(heard, -0.14, 0.14).double() * depths  # the first block of the tile, or the last
+    aside = torch.where(active, -0.14, 0.14).double() * depths  # the first block of the tile, or the last
     batch = replace(batch, means=torch.stack([aside, aside, depths], 1))
     cotangent = upstream(camera)
     cotangent[4:], cotangent[:, 4:] = 0, 0
     ours = draw(rasterize, cast(batch, dtype), camera, cotangent).gradients
     oracle = draw(reference.rasterize, batch, camera, cotangent).gradients
-    assert (oracle["means"][heard].norm(dim=1) > 1e-3).all()
-    assert (oracle["means"][~heard] == 0).all()
+    assert (oracle["means"][active].norm(dim=1) > 1e-3).all()
+    assert (oracle["means"][~active] == 0).all()
     for name, expected in oracle.items():
         assert relative(ours[name], expected) < (1e-12 if dtype == torch.float64 else 1e-5), name

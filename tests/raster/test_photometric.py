@@ -1,4 +1,4 @@
-"""Fused SSIM and L1: equal to plain torch, the same bits on any number of threads, bounded where clamped."""
+"""The fused photometric loss: equal to plain torch, the same bits for any number of threads, in range where clamped."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from graings import kernel
+from graings.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from graings.raster import photometric_reference
 from graings.raster.photometric import photometric, ssim
 from tests.raster.comparison import UNIT_ROUNDOFF, relative
@@ -31,6 +33,15 @@ def with_gradient(
     return value.detach(), gradient
 
 
+def test_the_kernel_is_compiled_with_the_constants_of_ssim() -> None:
+    constants = kernel.kernel().ssim_constants()
+    assert (constants["c1"], constants["c2"]) == (SSIM_C1, SSIM_C2)
+    distances = torch.arange(SSIM_WINDOW // 2 + 1, dtype=torch.float64)
+    taps = torch.exp(-distances.square() / (2 * SSIM_SIGMA**2))
+    taps /= taps[0] + 2 * taps[1:].sum()
+    torch.testing.assert_close(torch.tensor(constants["taps"], dtype=torch.float64), taps, rtol=1e-15, atol=0)
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_double_precision_equals_a_plain_convolution(size: tuple[int, int], isa: str) -> None:
     value, gradient = with_gradient(ssim, *pair(*size))
@@ -45,7 +56,7 @@ def test_single_precision_stays_close_to_double(size: tuple[int, int], isa: str)
     value, gradient = with_gradient(ssim, image, target)
     expected, expected_gradient = with_gradient(photometric_reference.ssim, image.double(), target.double())
     # Two passes of 11 products in [0, 1]: 24 roundings of moments <= 1, seen through the smallest divisor C2 = 9e-4.
-    bound = 24 * UNIT_ROUNDOFF / photometric_reference.C2
+    bound = 24 * UNIT_ROUNDOFF / SSIM_C2
     assert abs(value.double() - expected).item() <= bound
     assert relative(gradient, expected_gradient) <= bound
 
@@ -53,12 +64,10 @@ def test_single_precision_stays_close_to_double(size: tuple[int, int], isa: str)
 @pytest.mark.parametrize("squared", [0.0, 7.0])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("size", SIZES)
-def test_the_mixture_with_differences_equals_torch(
-    size: tuple[int, int], weight: float, squared: float, isa: str
-) -> None:
+def test_the_weighted_loss_equals_the_reference(size: tuple[int, int], weight: float, squared: float, isa: str) -> None:
     image, target = pair(*size)
     if image.numel() > 3:
-        image[0, 0] = target[0, 0]  # no difference, no direction
+        image[0, 0] = target[0, 0]  # the gradient of |x| at 0 is 0
 
     def ours(x: Tensor, y: Tensor) -> Tensor:
         return photometric(x, y, weight, squared)
@@ -113,12 +122,12 @@ def box(rows: slice, columns: slice) -> Callable[[Tensor, Tensor], Tensor]:
         box(slice(0, 60), slice(49, 50)),
         box(slice(8, 9), slice(30, 31)),
         box(slice(30, 30), slice(0, 0)),
-        pytest.param(lambda y, x: (x - 45 + y).abs() < 2, id="a slanted stripe, whose part of a row moves on"),
-        pytest.param(lambda y, x: (y - 12) * (y - 47) + x * (x - 49) == 0, id="four corners, far apart in rows"),
-        pytest.param(lambda y, x: (y % 23 == 4) & (x == 3 * (y // 23)), id="rows that see nothing between others"),
+        pytest.param(lambda y, x: (x - 45 + y).abs() < 2, id="a slanted stripe"),
+        pytest.param(lambda y, x: (y - 12) * (y - 47) + x * (x - 49) == 0, id="the outline of a rectangle"),
+        pytest.param(lambda y, x: (y % 23 == 4) & (x == 3 * (y // 23)), id="rows without differences between others"),
     ],
 )
-def test_what_is_equal_is_left_out_and_changes_nothing(
+def test_skipping_equal_pixels_does_not_change_the_loss(
     differs: Callable[[Tensor, Tensor], Tensor], level: float | None, isa: str
 ) -> None:
     image, target = pair(60, 50)
@@ -133,12 +142,12 @@ def test_what_is_equal_is_left_out_and_changes_nothing(
         value, gradient = with_gradient(ours, image, target)
         expected, expected_gradient = with_gradient(plain, image, target)
         torch.testing.assert_close(value, expected, rtol=0, atol=1e-12)
-        # The oracle's own rounding where nothing differs: 24 moments <= 1 through the smallest divisor C2, in float64.
-        noise = 24 * 2.0**-53 / photometric_reference.C2 / image.numel()
+        # The oracle's own rounding in equal parts: 24 moments <= 1 through the smallest divisor C2, in float64.
+        noise = 24 * 2.0**-53 / SSIM_C2 / image.numel()
         assert ((gradient - expected_gradient).abs() <= 1e-12 * expected_gradient.abs().max() + noise).all()
 
 
-def test_a_number_that_is_none_is_a_difference() -> None:
+def test_nan_counts_as_a_difference() -> None:
     image, _ = pair(40, 40)
     target = image.clone()
     image[20, 20, 1] = torch.nan
@@ -152,7 +161,7 @@ def test_gradcheck_passes() -> None:
     assert torch.autograd.gradcheck(lambda x: ssim(x, target), image.clone().requires_grad_())
 
 
-def test_misuse_is_named() -> None:
+def test_misuse_is_refused_by_name() -> None:
     image, target = pair(4, 4)
     with pytest.raises(ValueError, match=r"image must have shape \(H, W, 3\)"):
         ssim(image[..., 0], target)

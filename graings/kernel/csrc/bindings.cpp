@@ -1,4 +1,4 @@
-// The Python face of the kernel. Arrays come in through DLPack; nothing here knows torch.
+// Python bindings. Arrays are passed through DLPack, so the kernel does not depend on torch.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -7,6 +7,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <iterator>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -40,12 +41,12 @@ auto* checked(const std::optional<Array>& array, size_t size, const char* name) 
     return array ? checked(*array, size, name) : nullptr;
 }
 
-// Frames take addresses, 0 for what is not there: arrays would cost a fifth of the time of a small one. Who calls has
-// checked shapes, dtypes and that numbers follow each other.
+// Frames take memory addresses, 0 for null: array arguments would cost a fifth of the time of a small frame. The caller
+// has checked shapes, dtypes and contiguity.
 using Address = uintptr_t;
 template <class T> T* at(Address address) { return reinterpret_cast<T*>(address); }
 template <class T> T* needed(Address address, int64_t count, const char* name) {
-    if (!address && count) throw std::invalid_argument(std::string(name) + " has no memory");
+    if (!address && count) throw std::invalid_argument(std::string(name) + " must not be null");
     return at<T>(address);
 }
 
@@ -70,7 +71,7 @@ graings::Network<R> network(const In<R>& input, int64_t rows, const std::vector<
     }
     checked(input, size_t(rows * result.widths[0]), "input");
     if (!shared) return result;
-    if (!group) throw std::invalid_argument("what is shared needs the group of every row");
+    if (!group) throw std::invalid_argument("shared needs the group of every row");
     result.groups = int64_t(shared->shape(0));
     result.shared = checked(*shared, size_t(result.groups * result.widths[1]), "shared");
     result.group = checked(*group, size_t(rows), "group");
@@ -78,38 +79,38 @@ graings::Network<R> network(const In<R>& input, int64_t rows, const std::vector<
 }
 
 template <class R>
-graings::Anchors<R> anchors(const In<R>& place, const In<R>& log_scale, const In<R>& offset) {
-    const size_t count = place.shape(0), slots = offset.shape(1);
-    return {int64_t(count), int64_t(slots), place.data(), checked(log_scale, 3 * count, "log_scales"), checked(offset, 3 * count * slots, "offsets")};
+graings::Anchors<R> anchors(const In<R>& position, const In<R>& log_scale, const In<R>& offset) {
+    const size_t count = position.shape(0), slots = offset.shape(1);
+    return {int64_t(count), int64_t(slots), position.data(), checked(log_scale, 3 * count, "log_scales"), checked(offset, 3 * count * slots, "offsets")};
 }
 
 template <class R>
-graings::Answers<R> answers(const In<R>& canonical, const In<R>& base, const In<R>& centre, const std::optional<In<R>>& moved, double extent, double change,
+graings::NetworkOutputs<R> network_outputs(const In<R>& canonical, const In<R>& base, const In<R>& centre, const std::optional<In<R>>& deformation, double extent, double change,
                             double low, double high, bool projected) {
     const size_t drawn = base.shape(0);
     return {int64_t(drawn), checked(canonical, 7 * drawn, "canonical"), checked(base, 3 * drawn, "base"), checked(centre, 3 * drawn, "centre"),
-            checked(moved, 10 * drawn, "moved"), extent, {change, low, high, projected}};
+            checked(deformation, 10 * drawn, "deformation"), extent, {change, low, high, projected}};
 }
 
-// Of a direction, of degrees 1 to `degree`.
+// Number of spherical harmonics of degrees 1 to `degree`.
 size_t harmonics_of(int degree) {
-    if (degree < 1 || degree > 3) throw std::invalid_argument("harmonics have a degree from 1 to 3");
+    if (degree < 1 || degree > 3) throw std::invalid_argument("degree must lie in [1, 3]");
     return size_t(degree * (degree + 2));
 }
 
 template <class R>
 void bind_children(nb::module_& m) {
-    m.def("gather", [](In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, Out<R> row, Out<R> centre, Out<R> base, int threads) {
-        const auto from = anchors<R>(place, log_scale, offset);
+    m.def("gather", [](In<R> position, In<R> log_scale, In<R> offset, In<int64_t> children, Out<R> row, Out<R> centre, Out<R> base, int threads) {
+        const auto from = anchors<R>(position, log_scale, offset);
         const size_t drawn = children.size();
         R *rows = checked(row, drawn * size_t(3 + from.slots), "row"), *centres = checked(centre, 3 * drawn, "centre");
         R* bases = checked(base, 3 * drawn, "base");
         nb::gil_scoped_release release;
         graings::gather<R>(from, int64_t(drawn), children.data(), rows, centres, bases, threads);
     });
-    m.def("gather_gradient", [](In<R> place, In<R> log_scale, In<R> offset, In<int64_t> children, In<R> v_row, In<R> v_centre, In<R> v_base, Out<R> v_log_scale,
+    m.def("gather_gradient", [](In<R> position, In<R> log_scale, In<R> offset, In<int64_t> children, In<R> v_row, In<R> v_centre, In<R> v_base, Out<R> v_log_scale,
                                 Out<R> v_offset, int threads) {
-        const auto from = anchors<R>(place, log_scale, offset);
+        const auto from = anchors<R>(position, log_scale, offset);
         const size_t drawn = children.size();
         const R *row = checked(v_row, drawn * size_t(3 + from.slots), "v_row"), *centre = checked(v_centre, 3 * drawn, "v_centre");
         const R* base = checked(v_base, 3 * drawn, "v_base");
@@ -117,23 +118,23 @@ void bind_children(nb::module_& m) {
         nb::gil_scoped_release release;
         graings::gather_gradient<R>(from, int64_t(drawn), children.data(), row, centre, base, scales, offsets, threads);
     });
-    m.def("compose", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> moved, double extent, double change, double low, double high, bool projected,
+    m.def("compose", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> deformation, double extent, double change, double low, double high, bool projected,
                         Out<R> mean, Out<R> quat, Out<R> log_scale, int threads) {
-        const auto in = answers<R>(canonical, base, centre, moved, extent, change, low, high, projected);
+        const auto in = network_outputs<R>(canonical, base, centre, deformation, extent, change, low, high, projected);
         const size_t drawn = size_t(in.drawn);
         R *means = checked(mean, 3 * drawn, "mean"), *quats = checked(quat, 4 * drawn, "quat"), *scales = checked(log_scale, 3 * drawn, "log_scale");
         nb::gil_scoped_release release;
         graings::compose<R>(in, means, quats, scales, threads);
     });
-    m.def("compose_gradient", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> moved, double extent, double change, double low, double high,
-                                 bool projected, In<R> v_mean, In<R> v_quat, In<R> v_log_scale, Out<R> v_canonical, std::optional<Out<R>> v_moved, int threads) {
-        const auto in = answers<R>(canonical, base, centre, moved, extent, change, low, high, projected);
+    m.def("compose_gradient", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> deformation, double extent, double change, double low, double high,
+                                 bool projected, In<R> v_mean, In<R> v_quat, In<R> v_log_scale, Out<R> v_canonical, std::optional<Out<R>> v_deformation, int threads) {
+        const auto in = network_outputs<R>(canonical, base, centre, deformation, extent, change, low, high, projected);
         const size_t drawn = size_t(in.drawn);
         const R *means = checked(v_mean, 3 * drawn, "v_mean"), *quats = checked(v_quat, 4 * drawn, "v_quat"), *scales = checked(v_log_scale, 3 * drawn, "v_log_scale");
-        R *out = checked(v_canonical, 7 * drawn, "v_canonical"), *out_moved = checked(v_moved, 10 * drawn, "v_moved");
-        if (bool(out_moved) != bool(in.moved)) throw std::invalid_argument("moved and its gradient belong together");
+        R *out = checked(v_canonical, 7 * drawn, "v_canonical"), *out_deformation = checked(v_deformation, 10 * drawn, "v_deformation");
+        if (bool(out_deformation) != bool(in.deformation)) throw std::invalid_argument("deformation and v_deformation must be given together");
         nb::gil_scoped_release release;
-        graings::compose_gradient<R>(in, means, quats, scales, out, out_moved, threads);
+        graings::compose_gradient<R>(in, means, quats, scales, out, out_deformation, threads);
     });
 }
 
@@ -152,9 +153,9 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
             const char* names[] = {"project", "bin", "sort", "blend", "blend gradient", "geometry gradient"};
             for (int i = 0; i < graings::kStages; i++) stages[names[i]] = frame.seconds()[i];
             return stages;
-        }, "of each stage")
-        .def_prop_ro("pairs", &Frame<R>::pairs, "(tile, Gaussian) pairs")
-        .def_prop_ro("evaluated", &Frame<R>::evaluated, "(pixel, Gaussian) pairs that were looked at")
+        }, "Seconds of each stage.")
+        .def_prop_ro("pairs", &Frame<R>::pairs, "Number of (tile, Gaussian) pairs.")
+        .def_prop_ro("evaluated", &Frame<R>::evaluated, "Number of (pixel, Gaussian) pairs that were evaluated.")
         .def("pixels_gradient",
              [](Frame<R>& frame, Address background, Address v_color, Address v_alpha, Address v_depth, Address g_background, int threads) {
                  const R *ground = needed<R>(background, 1, "background"), *color = needed<R>(v_color, 1, "v_color");
@@ -223,7 +224,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         const R* upstream = checked(v_output, size_t(rows * layers.widths.back()), "v_output");
         R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows)), "hidden");
         R *v_in = checked(v_input, input.size(), "v_input"), *v_common = checked(v_shared, shared ? shared->size() : 0, "v_shared");
-        if (shared && !v_common) throw std::invalid_argument("what is shared needs a place for its gradient");
+        if (shared && !v_common) throw std::invalid_argument("shared needs v_shared for its gradient");
         if (v_weights.size() != weights.size() || v_biases.size() != weights.size()) throw std::invalid_argument("one gradient per weight and bias");
         std::vector<R*> w, b;
         for (size_t l = 0; l < weights.size(); l++) {
@@ -246,21 +247,27 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
 }  // namespace
 
 NB_MODULE(_kernel, m) {
-    nb::set_leak_warnings(false);  // torch may hold graphs, and with them frames, until the interpreter is gone
+    nb::set_leak_warnings(false);  // torch may keep graphs, and with them frames, until the interpreter exits
     m.doc() = "Compiled rasterizer; use graings.raster.rasterize and graings.raster.photometric.";
     bind<float>(m, "FrameFloat", "draw_float");
     bind<double>(m, "FrameDouble", "draw_double");
     bind_children<float>(m);
     bind_children<double>(m);
     m.def("hidden_size", &graings::hidden_size, "widths"_a, "rows"_a, "Elements that a network's hidden activations take.");
+    m.def("ssim_constants", [] {
+        nb::dict constants;
+        constants["taps"] = std::vector<double>(std::begin(graings::kSsimTaps), std::end(graings::kSsimTaps));
+        constants["c1"] = graings::kSsimC1, constants["c2"] = graings::kSsimC2;
+        return constants;
+    }, "What `compare` is compiled with: the window's taps from its centre outwards, C1 and C2.");
     m.def("keep_freed_memory", [] {
 #ifdef __GLIBC__
-        // A threshold would not do: glibc accepts 32 MB at most, and activations of 21 000 rows of 3 x 128 are larger.
+        // Not M_MMAP_THRESHOLD: glibc accepts 32 MB at most, and activations of 21 000 rows of 3 x 128 are larger.
         mallopt(M_MMAP_MAX, 0);
         mallopt(M_TRIM_THRESHOLD, 1 << 30);
 #endif
     });
     m.def("available_isas", &graings::available_isas, "Instruction sets this CPU can run, best first.");
     m.def("active_isa", &graings::active_isa, "The instruction set in use.");
-    m.def("use_isa", &graings::use_isa, "name"_a, "Choose an instruction set for the whole process.");
+    m.def("use_isa", &graings::use_isa, "name"_a, "Select an instruction set for the whole process.");
 }

@@ -11,19 +11,19 @@ namespace graings {
 
 namespace {
 
-constexpr int64_t kMostEntries = 1 << 24;  // of a tile: their numbers are kept in R
-constexpr int64_t kFew = 24;               // sorted by comparison alone
-constexpr int kLongestDigit = 11;
+constexpr int64_t kMaxEntries = 1 << 24;  // per tile: entry numbers are stored in R, where they must be exact
+constexpr int64_t kMaxInsertionSort = 24;               // pairs; longer lists go through the radix passes first
+constexpr int kMaxDigitBits = 11;
 
-uint64_t bits_of_depth(double depth) { return std::bit_cast<uint64_t>(depth); }  // positive: ordered like the numbers
+uint64_t bits_of_depth(double depth) { return std::bit_cast<uint64_t>(depth); }  // bit patterns of positive numbers have the order of the numbers
 
-// A tighter look at so few tiles would cost more than the tiles it saves.
+// For so few tiles, the row-by-row test costs more than the tiles it removes.
 bool is_small(const Span& span) { return span.count <= 16; }
 
-// Tiles that a record may touch, row by row: visit(row of tiles, first tile column, last one).
+// Calls visit(row of tiles, first tile column, last tile column) for the tiles that the record's ellipse may touch.
 template <class R, class Visit>
 void each_tile_row(const Record<R>& record, const Span& span, int64_t width, Visit visit) {
-    const double sr = double(record.look.sr), sy = double(record.look.sy), level = double(record.look.level), steep = record.slope * sr;
+    const double sr = double(record.params.sr), sy = double(record.params.sy), level = double(record.params.level), steep = record.slope * sr;
     const double highest = std::sqrt(level) / sy, turn = highest * steep / std::sqrt(steep * steep + sy * sy);
     for (uint32_t row = span.first_row(); row <= span.last_row(); row++) {
         const double low = std::max(double(row * kTile) + 0.5 - record.y, -highest);
@@ -33,7 +33,7 @@ void each_tile_row(const Record<R>& record, const Span& span, int64_t width, Vis
             const double dy = std::clamp(side * turn, low, high), s = dy * sy;
             return record.x + record.slope * dy + side * std::sqrt(std::max(level - s * s, 0.0)) / sr;
         };
-        // the pixel centres inside
+        // first and last pixel centre inside
         const double from = std::ceil(std::max(edge(-1) - 0.5, 0.0)), to = std::floor(std::min(edge(1) - 0.5, double(width) - 1));
         if (from > to) continue;
         const uint32_t first = std::max(uint32_t(from) / kTile, span.first_column()), last = std::min(uint32_t(to) / kTile, span.last_column());
@@ -41,7 +41,7 @@ void each_tile_row(const Record<R>& record, const Span& span, int64_t width, Vis
     }
 }
 
-// Blocks of a tile, one bit each, row by row: those from a column or row of blocks on, and those up to it.
+// Masks of a tile's blocks, one bit each, row by row: from a column or row of blocks on, and up to it.
 constexpr uint32_t kColumnsFrom[] = {0xFFFF, 0xEEEE, 0xCCCC, 0x8888}, kColumnsTo[] = {0x1111, 0x3333, 0x7777, 0xFFFF};
 constexpr uint32_t kRowsFrom[] = {0xFFFF, 0xFFF0, 0xFF00, 0xF000}, kRowsTo[] = {0x000F, 0x00FF, 0x0FFF, 0xFFFF};
 
@@ -56,15 +56,15 @@ Binning<R>::Binning(const Camera& camera, bool compat, int64_t gaussians, const 
 template <class R>
 void Binning<R>::count(Piece& piece) {
     auto& counts = counts_[size_t(piece.worker)];
-    if (counts.empty()) counts.assign(size_t(tiles_ + across_ + 1), 0);  // beyond the last tile nothing is counted
+    if (counts.empty()) counts.assign(size_t(tiles_ + across_ + 1), 0);  // padding: the branchless path below adds 0 beyond the last tile
     uint32_t* tile = counts.data();
     for (int64_t i = piece.begin; i < piece.end; i++) {
         Span& span = spans_[i];
-        places[size_t(i)] = uint32_t(piece.pairs);  // of this piece
+        places[size_t(i)] = uint32_t(piece.pairs);  // relative to the piece
         if (span.count == 0) continue;
         const uint32_t columns = span.last_column() - span.first_column(), rows = span.last_row() - span.first_row();
         uint32_t* first = tile + span.first_row() * across_ + span.first_column();
-        if ((columns | rows) < 2) {  // most are small: no branch to guess
+        if ((columns | rows) < 2) {  // most Gaussians: one or two tiles each way, without a branch
             first[0]++, first[1] += columns, first[across_] += rows, first[across_ + 1] += columns & rows;
         } else if (compat_ || is_small(span)) {
             for (uint32_t row = 0; row <= rows; row++, first += across_)
@@ -103,9 +103,9 @@ void Binning<R>::enter(const std::vector<Piece>& pieces) {
     int64_t total = 0;
     for (int64_t tile = 0; tile < tiles_; tile++) {
         begin[size_t(tile)] = total;
-        for (auto& counts : counts_)  // from now on where the worker's next pair goes
+        for (auto& counts : counts_)  // counts become write positions
             if (!counts.empty()) total += std::exchange(counts[size_t(tile)], uint32_t(total));
-        if (total - begin[size_t(tile)] > kMostEntries) throw std::length_error("more than 2^24 Gaussians on one tile");
+        if (total - begin[size_t(tile)] > kMaxEntries) throw std::length_error("more than 2^24 Gaussians on one tile");
     }
     begin[size_t(tiles_)] = total;
     places[pieces.empty() ? 0 : size_t(pieces.back().end)] = uint32_t(total);
@@ -126,17 +126,17 @@ void Binning<R>::enter(const Piece& piece, uint32_t first_place, uint32_t* next)
         const uint32_t id = uint32_t(i), depth = key(i), columns = span.last_column() - span.first_column(), rows = span.last_row() - span.first_row();
         const uint32_t left = kColumnsFrom[span.left % Span::kPerTile], right = kColumnsTo[span.right % Span::kPerTile];
         const uint32_t top = kRowsFrom[span.top % Span::kPerTile], bottom = kRowsTo[span.bottom % Span::kPerTile];
-        if ((columns | rows) < 2) {  // most are small: no branch to guess
+        if ((columns | rows) < 2) {  // most Gaussians, as above
             uint32_t* at = next + span.first_row() * across_ + span.first_column();
             const uint32_t first_columns = columns ? left : left & right, first_rows = rows ? top : top & bottom;
             const auto put = [&](uint32_t& to, uint32_t there, uint32_t place, uint32_t mask) {
                 Pair* pair = out + to;
                 pair = there ? pair : &nowhere;
-                __builtin_prefetch(pair + 4, 1);  // where this tile's next ones go
+                __builtin_prefetch(pair + 4, 1);  // for the next pairs of this tile
                 *pair = {depth, id, place, mask}, to += there;
             };
             put(at[0], 1, begin, first_columns & first_rows);
-            if (columns & rows) {  // a quarter of them: rarer than what the other two would cost for nothing
+            if (columns & rows) {  // a quarter of them: too rare to write all four pairs always
                 put(at[1], 1, begin + 1, right & first_rows);
                 put(at[across_], 1, begin + 2, first_columns & bottom), put(at[across_ + 1], 1, begin + 3, right & bottom);
             } else
@@ -169,22 +169,22 @@ void Binning<R>::sort() {
     });
 }
 
-// By the leading bits of the key in two passes, as many bits as leave few neighbours equal; then those by comparison.
-// `half` holds what the first pass has sorted.
+// Two radix passes over the leading bits of the key, as many as make equal neighbours rare, then insertion sort by full
+// comparison. `half` is the output of the first pass.
 template <class R>
 void Binning<R>::sort(Pair* pairs, int64_t count, std::vector<Pair>& half) const {
     const auto before = [&](const Pair& a, const Pair& b) {
         if (a.key != b.key) return a.key < b.key;
         return std::tuple(depths_[a.id], uids_[a.id], a.id) < std::tuple(depths_[b.id], uids_[b.id], b.id);
     };
-    if (count > kFew) {
+    if (count > kMaxInsertionSort) {
         if (int64_t(half.size()) < count) half.resize(size_t(2 * count));
         uint32_t least = ~uint32_t(0), most = 0;
         for (int64_t i = 0; i < count; i++) least = std::min(least, pairs[i].key), most = std::max(most, pairs[i].key);
-        const int digit = std::min(int(std::bit_width(uint64_t(count))) - 1, kLongestDigit), bins = 1 << digit;
+        const int digit = std::min(int(std::bit_width(uint64_t(count))) - 1, kMaxDigitBits), bins = 1 << digit;
         const int shift = std::max(int(std::bit_width(most - least)) - 2 * digit, 0);
         const auto lead = [&](uint32_t key) { return (key - least) >> shift; };
-        uint32_t low[1 << kLongestDigit], high[1 << kLongestDigit];
+        uint32_t low[1 << kMaxDigitBits], high[1 << kMaxDigitBits];
         std::fill_n(low, bins, 0), std::fill_n(high, bins, 0);
         for (int64_t i = 0; i < count; i++) {
             const uint32_t l = lead(pairs[i].key);
@@ -195,7 +195,7 @@ void Binning<R>::sort(Pair* pairs, int64_t count, std::vector<Pair>& half) const
         for (int64_t i = 0; i < count; i++) half[low[lead(pairs[i].key) & (bins - 1)]++] = pairs[i];
         for (int64_t i = 0; i < count; i++) pairs[high[lead(half[size_t(i)].key) >> digit]++] = half[size_t(i)];
     }
-    int64_t moves = 16 * count;  // more are left to a sort that takes n log n whatever comes
+    int64_t moves = 16 * count;  // beyond this std::sort takes over, whose worst case is n log n
     for (int64_t i = 1; i < count; i++) {
         if (!before(pairs[i], pairs[i - 1])) continue;
         const Pair pair = pairs[i];

@@ -1,4 +1,4 @@
-// An array without initialisation, aligned to a cache line.
+// An uninitialised array, aligned to a cache line.
 #pragma once
 #include <algorithm>
 #include <cstddef>

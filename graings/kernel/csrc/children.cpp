@@ -9,14 +9,14 @@
 namespace graings {
 namespace {
 
-constexpr int64_t kPiece = 2048;  // children handed to a thread at a time
+constexpr int64_t kPiece = 2048;  // children per piece of work
 
 template <class Body>
 void in_pieces(int threads, int64_t count, Body body) {
     parallel_for(threads, (count + kPiece - 1) / kPiece, [&](int, int64_t piece) { body(piece * kPiece, std::min(count, (piece + 1) * kPiece)); });
 }
 
-// Runs of anchors with about as many children each: body(first anchor, last, first child, last).
+// Calls body(first anchor, last, first child, last) for ranges of anchors and their drawn children.
 template <class Body>
 void in_runs(int threads, int64_t anchors, int64_t slots, int64_t drawn, const int64_t* children, Body body) {
     constexpr int64_t kRun = 512;
@@ -37,7 +37,7 @@ Quat<R> product(const Quat<R>& a, const Quat<R>& b) {
 }
 template <class R> Quat<R> conjugate(const Quat<R>& q) { return {q.w, -q.x, -q.y, -q.z}; }
 
-// Below this norm there is no direction (as torch's normalize, whose divisor stops there).
+// Smallest divisor of the normalisation, as in torch's normalize.
 constexpr double kLeastNorm = 1e-12;
 
 template <class R>
@@ -47,14 +47,14 @@ Quat<R> canonical(const R* raw, R& norm) {
     return {q.w / norm, q.x / norm, q.y / norm, q.z / norm};
 }
 
-template <class R> Quat<R> turn(const R* moved) { return {moved[3] + R(1), moved[4], moved[5], moved[6]}; }
+template <class R> Quat<R> deformed_rotation(const R* deformation) { return {deformation[3] + R(1), deformation[4], deformation[5], deformation[6]}; }
 
-// A NaN passes through: it must reach whoever looks for one.
+// A NaN passes, so that later checks find it.
 template <class R> R clip(R x, R low, R high) { return x < low ? low : x > high ? high : x; }
 
-// The gradient that passes a clip at x.
+// The gradient through a clip of x.
 template <class R>
-R through(R v, R x, R low, R high, bool projected) {
+R clip_gradient(R v, R x, R low, R high, bool projected) {
     if (x > high) return projected && v > R(0) ? v : R(0);
     if (x < low) return projected && v < R(0) ? v : R(0);
     return v;
@@ -78,7 +78,7 @@ void gather(const Anchors<R>& anchors, int64_t drawn, const int64_t* children, R
             for (int c = 0; c < 3; c++) {
                 const R scale = anchors.log_scale[3 * owner + c];
                 base[3 * i + c] = scale;
-                centre[3 * i + c] = anchors.place[3 * owner + c] + std::exp(scale) * anchors.offset[3 * children[i] + c];
+                centre[3 * i + c] = anchors.position[3 * owner + c] + std::exp(scale) * anchors.offset[3 * children[i] + c];
             }
         }
     });
@@ -104,19 +104,19 @@ void gather_gradient(const Anchors<R>& anchors, int64_t drawn, const int64_t* ch
 }
 
 template <class R>
-void compose(const Answers<R>& in, R* mean, R* quat, R* log_scale, int threads) {
+void compose(const NetworkOutputs<R>& in, R* mean, R* quat, R* log_scale, int threads) {
     const R extent = R(in.extent), change = R(in.bounds.change), low = R(in.bounds.low), high = R(in.bounds.high);
     in_pieces(threads, in.drawn, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i++) {
-            const R* moved = in.moved ? in.moved + 10 * i : nullptr;
+            const R* deformation = in.deformation ? in.deformation + 10 * i : nullptr;
             R norm;
             Quat<R> q = canonical(in.canonical + 7 * i, norm);
-            if (moved) q = product(q, turn(moved));
+            if (deformation) q = product(q, deformed_rotation(deformation));
             quat[4 * i] = q.w, quat[4 * i + 1] = q.x, quat[4 * i + 2] = q.y, quat[4 * i + 3] = q.z;
             for (int c = 0; c < 3; c++) {
                 R scale = in.base[3 * i + c] + in.canonical[7 * i + 4 + c];
                 mean[3 * i + c] = in.centre[3 * i + c];
-                if (moved) mean[3 * i + c] += moved[c] * extent, scale += clip(moved[7 + c], -change, change);
+                if (deformation) mean[3 * i + c] += deformation[c] * extent, scale += clip(deformation[7 + c], -change, change);
                 log_scale[3 * i + c] = clip(scale, low, high);
             }
         }
@@ -124,31 +124,31 @@ void compose(const Answers<R>& in, R* mean, R* quat, R* log_scale, int threads) 
 }
 
 template <class R>
-void compose_gradient(const Answers<R>& in, const R* v_mean, const R* v_quat, const R* v_log_scale, R* v_canonical, R* v_moved, int threads) {
+void compose_gradient(const NetworkOutputs<R>& in, const R* v_mean, const R* v_quat, const R* v_log_scale, R* v_canonical, R* v_deformation, int threads) {
     const R extent = R(in.extent), change = R(in.bounds.change), low = R(in.bounds.low), high = R(in.bounds.high);
     in_pieces(threads, in.drawn, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i++) {
-            const R* moved = in.moved ? in.moved + 10 * i : nullptr;
+            const R* deformation = in.deformation ? in.deformation + 10 * i : nullptr;
             R norm;
             const Quat<R> q = canonical(in.canonical + 7 * i, norm);
             Quat<R> v{v_quat[4 * i], v_quat[4 * i + 1], v_quat[4 * i + 2], v_quat[4 * i + 3]};
-            if (moved) {
-                // quaternions multiply without changing angles: the adjoint of a factor is its conjugate
+            if (deformation) {
+                // the adjoint of multiplication by a quaternion is multiplication by its conjugate
                 const Quat<R> t = product(conjugate(q), v);
-                v_moved[10 * i + 3] = t.w, v_moved[10 * i + 4] = t.x, v_moved[10 * i + 5] = t.y, v_moved[10 * i + 6] = t.z;
-                v = product(v, conjugate(turn(moved)));
+                v_deformation[10 * i + 3] = t.w, v_deformation[10 * i + 4] = t.x, v_deformation[10 * i + 5] = t.y, v_deformation[10 * i + 6] = t.z;
+                v = product(v, conjugate(deformed_rotation(deformation)));
             }
             const R along = norm > R(kLeastNorm) ? v.w * q.w + v.x * q.x + v.y * q.y + v.z * q.z : R(0);
             R* to = v_canonical + 7 * i;
             to[0] = (v.w - along * q.w) / norm, to[1] = (v.x - along * q.x) / norm, to[2] = (v.y - along * q.y) / norm, to[3] = (v.z - along * q.z) / norm;
             for (int c = 0; c < 3; c++) {
                 R scale = in.base[3 * i + c] + in.canonical[7 * i + 4 + c];
-                if (moved) scale += clip(moved[7 + c], -change, change);
-                const R g = through(v_log_scale[3 * i + c], scale, low, high, in.bounds.projected);
+                if (deformation) scale += clip(deformation[7 + c], -change, change);
+                const R g = clip_gradient(v_log_scale[3 * i + c], scale, low, high, in.bounds.projected);
                 to[4 + c] = g;
-                if (!moved) continue;
-                v_moved[10 * i + c] = v_mean[3 * i + c] * extent;
-                v_moved[10 * i + 7 + c] = through(g, moved[7 + c], -change, change, in.bounds.projected);
+                if (!deformation) continue;
+                v_deformation[10 * i + c] = v_mean[3 * i + c] * extent;
+                v_deformation[10 * i + 7 + c] = clip_gradient(g, deformation[7 + c], -change, change, in.bounds.projected);
             }
         }
     });
@@ -157,8 +157,8 @@ void compose_gradient(const Answers<R>& in, const R* v_mean, const R* v_quat, co
 #define GRAINGS_INSTANTIATE(R)                                                                                                           \
     template void gather<R>(const Anchors<R>&, int64_t, const int64_t*, R*, R*, R*, int);                                                \
     template void gather_gradient<R>(const Anchors<R>&, int64_t, const int64_t*, const R*, const R*, const R*, R*, R*, int);              \
-    template void compose<R>(const Answers<R>&, R*, R*, R*, int);                                                                        \
-    template void compose_gradient<R>(const Answers<R>&, const R*, const R*, const R*, R*, R*, int);
+    template void compose<R>(const NetworkOutputs<R>&, R*, R*, R*, int);                                                                        \
+    template void compose_gradient<R>(const NetworkOutputs<R>&, const R*, const R*, const R*, R*, R*, int);
 GRAINGS_INSTANTIATE(float)
 GRAINGS_INSTANTIATE(double)
 #undef GRAINGS_INSTANTIATE

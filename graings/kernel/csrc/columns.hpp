@@ -1,5 +1,5 @@
-// Eight rows of a table become columns of float64, one vector each, and columns become rows: of plain arrays and of
-// records. Knows nothing of what the numbers mean.
+// Transposition between eight rows of a table and columns, each a vector of eight float64 numbers; for arrays, records and
+// spans.
 #pragma once
 #include "simd.hpp"
 #include "types.hpp"
@@ -9,7 +9,7 @@ namespace graings::GRAINGS_ISA {
 constexpr int kGroup = 8;
 using D = Vec<double, kGroup>;
 
-// Where number k of eight rows of W lies among their columns, each of eight numbers, or the other way round.
+// Permutation from eight rows of W numbers to W columns of eight numbers, or back.
 template <int W, bool ToRows>
 struct Places {
     alignas(64) int32_t at[(8 * W + 15) / 16 * 16] = {};
@@ -19,7 +19,7 @@ struct Places {
 };
 
 #if defined(__AVX512F__)
-// The numbers of up to two registers in another order, in the `part`-th register.
+// The `part`-th register of the permuted numbers of up to two registers.
 template <int W, bool ToRows>
 GRAINGS_INLINE __m512 reordered(__m512 a, __m512 b, int part) {
     static constexpr Places<W, ToRows> places;
@@ -27,7 +27,7 @@ GRAINGS_INLINE __m512 reordered(__m512 a, __m512 b, int part) {
     return 8 * W > 16 ? _mm512_permutex2var_ps(a, at, b) : _mm512_permutexvar_ps(at, a);
 }
 
-// Eight registers of eight numbers as a square: rows become columns.
+// Transposes an 8x8 matrix in registers.
 GRAINGS_INLINE void transpose(__m512d (&x)[8]) {
     __m512d two[2][4];  // columns odd, 2 + odd, 4 + odd and 6 + odd of rows 2k and 2k + 1
     for (int k = 0; k < 4; k++) two[0][k] = _mm512_unpacklo_pd(x[2 * k], x[2 * k + 1]), two[1][k] = _mm512_unpackhi_pd(x[2 * k], x[2 * k + 1]);
@@ -39,18 +39,18 @@ GRAINGS_INLINE void transpose(__m512d (&x)[8]) {
     }
 }
 #elif defined(__AVX2__)
-// The numbers of W registers in another order, in the `part`-th register.
+// The `part`-th register of the permuted numbers of W registers.
 template <int W, bool ToRows>
 GRAINGS_INLINE __m256 reordered(const __m256 (&x)[W], int part) {
     static constexpr Places<W, ToRows> places;
     const __m256i at = _mm256_load_si256(reinterpret_cast<const __m256i*>(places.at + 8 * part)), source = _mm256_srli_epi32(at, 3);
-    __m256 found = _mm256_permutevar8x32_ps(x[0], at);  // by the lowest three bits
+    __m256 found = _mm256_permutevar8x32_ps(x[0], at);  // uses the lowest three bits of each index
     for (int k = 1; k < W; k++)
         found = _mm256_blendv_ps(found, _mm256_permutevar8x32_ps(x[k], at), _mm256_castsi256_ps(_mm256_cmpeq_epi32(source, _mm256_set1_epi32(k))));
     return found;
 }
 
-// Four registers of four numbers as a square: rows become columns.
+// Transposes a 4x4 matrix in registers.
 GRAINGS_INLINE void transpose(__m256d (&x)[4]) {
     const __m256d even = _mm256_unpacklo_pd(x[0], x[1]), odd = _mm256_unpackhi_pd(x[0], x[1]);
     const __m256d below_even = _mm256_unpacklo_pd(x[2], x[3]), below_odd = _mm256_unpackhi_pd(x[2], x[3]);
@@ -61,11 +61,11 @@ GRAINGS_INLINE void transpose(__m256d (&x)[4]) {
 GRAINGS_INLINE __m256d low(D x) { return (__m256d)x.lo.v; }
 GRAINGS_INLINE __m256d high(D x) { return (__m256d)x.hi.v; }
 GRAINGS_INLINE D both(__m256d low, __m256d high) { return {{(Native<double>)low}, {(Native<double>)high}}; }
-// Numbers that are whole and not negative, below 2^31.
+// Conversion of non-negative integers below 2^31.
 GRAINGS_INLINE __m256i whole(D x) { return _mm256_set_m128i(_mm256_cvttpd_epi32(high(x)), _mm256_cvttpd_epi32(low(x))); }
 #endif
 
-// The columns of a row-major [N, W] array for Gaussians begin..begin+7; past the end the last one repeats.
+// The columns of rows begin..begin+7 of a row-major [N, W] array; beyond the end the last row is repeated.
 template <int W, class R>
 GRAINGS_INLINE void columns_of(const R* rows, int64_t begin, int64_t count, D* columns) {
     if constexpr (W == 1)
@@ -107,7 +107,7 @@ GRAINGS_INLINE void columns_of(const R* rows, int64_t begin, int64_t count, D* c
     for (int c = 0; c < W; c++) columns[c] = load_as<kGroup>(lanes[c]);
 }
 
-// The way back, rounded to R, for those before the end.
+// The inverse, rounded to R, for the rows before `end`.
 template <int W, class R>
 GRAINGS_INLINE void store_columns(R* rows, int64_t begin, int64_t end, const D* columns) {
     if constexpr (W == 1)
@@ -147,7 +147,7 @@ GRAINGS_INLINE void store_columns(R* rows, int64_t begin, int64_t end, const D* 
 }
 
 #if defined(__AVX512F__)
-// Eight records from their columns: numbers of float64, and pairs of single precision that fill as much.
+// Eight records from their columns: float64 numbers, and pairs of float32 numbers of the same size.
 GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*pairs)[2]) {
     __m512d column[8] = {};  // the last one is not used
     for (int c = 0; c < 3; c++) column[c] = (__m512d)whole[c].v;
@@ -160,7 +160,7 @@ GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*p
     for (int row = 0; row < 8; row++) _mm512_storeu_pd(to + row, column[row]);
 }
 #elif defined(__AVX2__)
-// Eight records from their columns: numbers of float64, and pairs of single precision that fill as much.
+// Eight records from their columns: float64 numbers, and pairs of float32 numbers of the same size.
 GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*pairs)[2]) {
     const auto pair = [&](int c, bool upper) {
         const __m128 first = _mm256_cvtpd_ps(upper ? high(pairs[c][0]) : low(pairs[c][0])), second = _mm256_cvtpd_ps(upper ? high(pairs[c][1]) : low(pairs[c][1]));
@@ -178,7 +178,7 @@ GRAINGS_INLINE void store_records(Record<float>* to, const D* whole, const D (*p
 }
 #endif
 
-// Records of Gaussians begin..begin+7, as far as they come before the end.
+// Writes records begin..begin+7 before `end`.
 template <class R>
 GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, const D* whole, const D (*pairs)[2]) {
 #if defined(__AVX2__)
@@ -196,11 +196,11 @@ GRAINGS_INLINE void put_records(Record<R>* records, int64_t begin, int64_t end, 
         records[begin + i] = {x[0][i], x[1][i], x[2][i], {y[0][i], y[1][i], y[2][i], y[3][i], y[4][i], y[5][i], y[6][i], y[7][i]}};
 }
 
-// Spans of Gaussians begin..begin+7, as far as they come before the end: how many tiles, and the sides in blocks.
+// Writes spans begin..begin+7 before `end`: the number of tiles, and the sides in blocks.
 GRAINGS_INLINE void put_spans(Span* spans, int64_t begin, int64_t end, D tiles, const D (&sides)[4]) {
 #if defined(__AVX512F__)
     if (begin + kGroup <= end) {
-        // three columns of 32 bits: the count, and the sides two by two
+        // three columns of 32 bits: the count, and two sides each
         const auto whole = [](D x) { return _mm512_cvttpd_epu32((__m512d)x.v); };
         const auto side = [&](const D& low, const D& high) { return whole(fma(splat<double, kGroup>(65536), high, low)); };
         const __m512 a = _mm512_castsi512_ps(_mm512_inserti32x8(_mm512_castsi256_si512(whole(tiles)), side(sides[0], sides[1]), 1));
@@ -225,7 +225,7 @@ GRAINGS_INLINE void put_spans(Span* spans, int64_t begin, int64_t end, D tiles, 
         spans[begin + i] = {uint32_t(int32_t(count[i])), block(side[0][i]), block(side[1][i]), block(side[2][i]), block(side[3][i])};
 }
 
-// Small whole numbers of Gaussians begin..begin+7, as far as they come before the end.
+// Writes bytes begin..begin+7 before `end`.
 GRAINGS_INLINE void put_bytes(uint8_t* bytes, int64_t begin, int64_t end, D numbers) {
 #if defined(__AVX512F__)
     if (begin + kGroup <= end) {
@@ -245,10 +245,10 @@ GRAINGS_INLINE void put_bytes(uint8_t* bytes, int64_t begin, int64_t end, D numb
     for (int i = 0; i < kGroup && begin + i < end; i++) bytes[begin + i] = uint8_t(int32_t(whole[i]));
 }
 
-// A pair's sums as they are added up, in as many numbers as lie between pairs.
+// The total of the partial sums of a Gaussian's pairs.
 struct Sums { D first, rest; };
 
-// Adds a pair's sums if there are `any`. Half of the guesses whether there are would be wrong, and each costs more than the addition.
+// Adds a pair's sums if `any`, without a branch: it would be mispredicted half of the time, which costs more than adding.
 template <class R>
 GRAINGS_INLINE void add_sums(const R* of_pair, bool any, Sums& total) {
 #if defined(__AVX512F__)
@@ -291,7 +291,7 @@ GRAINGS_INLINE void columns_of_sums(const double (&rows)[kGroup][kSumStride], D 
     const __m512d even = every_other(0), odd = every_other(1);
     columns[8].v = (Native<double>)_mm512_unpacklo_pd(even, odd), columns[9].v = (Native<double>)_mm512_unpackhi_pd(even, odd);
 #elif defined(__AVX2__)
-    for (int part = 0; part < kSums; part += 4) {  // of the last one two columns are not used
+    for (int part = 0; part < kSums; part += 4) {  // the last part has two unused columns
         __m256d above[4], below[4];
         for (int i = 0; i < 4; i++) above[i] = _mm256_loadu_pd(rows[i] + part), below[i] = _mm256_loadu_pd(rows[4 + i] + part);
         transpose(above), transpose(below);

@@ -9,7 +9,7 @@ namespace graings {
 
 namespace {
 
-constexpr int64_t kPiece = 1024;  // rows handed to a thread at a time
+constexpr int64_t kPiece = 1024;  // rows per piece of work
 
 template <class Each>
 void each_row(int threads, int64_t rows, Each each) {
@@ -20,7 +20,7 @@ void each_row(int threads, int64_t rows, Each each) {
 
 constexpr int width_of(int degree) { return degree * (degree + 2); }
 
-// Factors that give each harmonic the mean square 1/3 over all directions.
+// Factors that give each harmonic a mean square of 1/3 over all directions.
 const double kA = std::sqrt(5.0), kB = std::sqrt(35.0 / 24), kC = std::sqrt(35.0), kD = std::sqrt(7.0 / 8), kE = std::sqrt(7.0 / 12), kF = std::sqrt(5.0 / 12);
 
 template <class R>
@@ -51,13 +51,13 @@ void harmonics_gradient(int degree, const double (&at)[3], const R* v, double (&
     gradient[0] = gx, gradient[1] = gy, gradient[2] = gz;
 }
 
-// A direction mirrored at the plane across a vector of any length.
+// A direction reflected at the plane with the given normal, of any length.
 struct Mirror {
     double direction[3], normal[3], squared, along;  // along: direction . normal / squared
 
     template <class R>
     Mirror(const R* of, const R* at) : direction{of[0], of[1], of[2]}, normal{at[0], at[1], at[2]} {
-        constexpr double kEpsilon = 1e-6;  // below a thousandth a normal fades out instead of spinning
+        constexpr double kEpsilon = 1e-6;  // normals shorter than 1e-3 reflect less and less, instead of in an undefined direction
         squared = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] + kEpsilon;
         along = (direction[0] * normal[0] + direction[1] * normal[1] + direction[2] * normal[2]) / squared;
     }
@@ -81,7 +81,7 @@ void encode(int64_t rows, int64_t dimensions, int octaves, const R* x, R* out, i
         for (int64_t d = 0; d < dimensions; d++) {
             const double value = double(x[row * dimensions + d]);
             to[d] = R(value);
-            // One sine and cosine, then doubled angles: an octave loses a bit, and float64 has 29 to spare.
+            // One sine and cosine, then double-angle formulas: each octave costs a bit, and float64 has 29 more than float32.
             double sine = std::sin(value), cosine = std::cos(value);
             R *sines = to + dimensions + d * octaves, *cosines = sines + dimensions * octaves;
             for (int l = 0; l < octaves; l++) {

@@ -1,4 +1,4 @@
-// Frequencies of positions, and spherical harmonics of directions. Knows nothing of what reads them.
+// Frequency encoding of positions and times, and spherical harmonics of directions.
 #pragma once
 #include <cstdint>
 
@@ -10,8 +10,8 @@ template <class R>
 void encode(int64_t rows, int64_t dimensions, int octaves, const R* x, R* out, int threads);
 
 // out [rows, width] of unit vectors [rows, 3]: real spherical harmonics of degrees 1 to `degree`, at most 3, scaled so that
-// the first three are the direction itself; width = degree (degree + 2). With `normals` [rows, 3], of any length, as many
-// more behind them: of the directions mirrored there.
+// the first three are the direction itself; width = degree (degree + 2). With `normals` [rows, 3], of any length, the
+// harmonics of the reflected directions follow.
 template <class R>
 void encode_directions(int64_t rows, int degree, const R* directions, const R* normals, R* out, int threads);
 

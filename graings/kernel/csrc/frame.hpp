@@ -1,4 +1,4 @@
-// One drawn view: runs the stages of the forward pass and keeps what the gradient needs, until it is asked for.
+// One drawn view: runs the stages of the forward pass and keeps the state that the backward pass needs.
 #pragma once
 #include <vector>
 #include "binning.hpp"
@@ -22,20 +22,20 @@ enum Stage { kProject, kBin, kSort, kBlend, kBlendGradient, kGeometryGradient, k
 template <class R>
 class Frame {
 public:
-    // `uids` break ties of depth. Keeps no pointer into `in` or `out`, and what a gradient needs only if there will be one.
+    // `uids` break ties of depth. Keeps no pointer into `in` or `out`; keeps state for the backward pass if `gradient`.
     Frame(const Camera&, const Settings&, const Inputs<R>& in, const int64_t* uids, const Outputs<R>& out, int threads, bool gradient);
 
-    // The gradient has two halves, one after the other, each once: what was kept is given back on the way.
-    // First that of the pixels: what every Gaussian adds up to, and that of the background. v_alpha, v_depth and
+    // The backward pass has two halves, called once each and in this order; both free the state they have used.
+    // First the gradient of the pixels: partial sums per pair, and the background's gradient. v_alpha, v_depth and
     // v_background may be null.
     void pixels_gradient(const R* background, const R* v_color, const R* v_alpha, const R* v_depth, R* v_background, int threads);
 
-    // Then that of the Gaussians. `in` must hold the same values as in the forward pass.
+    // Then the gradient of the Gaussians. `in` must hold the same values as in the forward pass.
     void gaussians_gradient(const Inputs<R>& in, const Gradients<R>& out, int threads);
 
     const int64_t* statuses() const { return statuses_; }
     int64_t pairs() const { return pair_count_; }
-    int64_t evaluated() const;  // pairs of pixel and Gaussian
+    int64_t evaluated() const;  // (pixel, Gaussian) pairs
     const double* seconds() const { return seconds_; }  // per Stage
 
 private:
@@ -54,8 +54,8 @@ private:
     Buffer<Pair> pairs_;
     Buffer<int32_t> kept_, items_;
     Buffer<Ranks> ranks_;
-    int64_t shown_ = 0;  // pairs
-    Buffer<std::byte> scratch_;  // of the Gaussians while they are binned, then of the pixels: never both
+    int64_t shown_ = 0;  // pairs that some block has drawn
+    Buffer<std::byte> scratch_;  // depths and spans during binning, then per-pixel state
     R *light_ = nullptr, *last_ = nullptr;
     Buffer<R> sums_;
 };

@@ -1,5 +1,5 @@
-// From Gaussians to records and back: projection in float64, eight at a time, whatever the pixels use.
-// Formulas: sheared footprint (a determinant without a subtraction) and its adjoint.
+// Projection of Gaussians to records and its adjoint: always in float64, eight Gaussians at a time.
+// The footprint is stored as a shear; its determinant is computed without a subtraction.
 #pragma once
 #include "columns.hpp"
 #include "ranks.hpp"
@@ -13,15 +13,15 @@ constexpr double kRootHalfLog2E = 0.8493218002880191;  // sqrt(log2(e) / 2)
 constexpr double kLn2 = 0.6931471805599453;
 constexpr double kLog2E = 1.4426950408889634;
 
-// Everything about eight Gaussians that both directions need.
+// Quantities of eight Gaussians that both passes need.
 struct Projected {
-    D z, inverse_z, ratio_x, ratio_y, held_x, held_y;  // held: clamped before the Jacobian
+    D z, inverse_z, ratio_x, ratio_y, clamped_x, clamped_y;  // held: clamped before the Jacobian
     D quat[4], squared, inverse_squared;
     D rotation[9], scale[3];
     D affine[6];      // Jacobian times world-to-camera rotation, 2x3
     D m1[3], m2[3];   // rows of the factor of the covariance
     D x, y, slope, v, c, inverse_c, a;
-    D finite;         // 0, or not a number
+    D finite;         // 0 if all inputs are finite, else NaN
 };
 
 struct Limits {
@@ -49,7 +49,7 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
     for (int i = 0; i < 3; i++) p.finite = p.finite + (mean[i] - mean[i]) + (rho[i] - rho[i]);
     for (int i = 0; i < 2; i++) p.finite = p.finite + (offset[i] - offset[i]);
 
-    // the difference first, then the rotation: a scene far from the origin does not cancel
+    // the difference comes before the rotation, to avoid cancellation far from the world's origin
     D away[3], camera[3];
     for (int i = 0; i < 3; i++) away[i] = mean[i] - d8(k.center[i]);
     for (int i = 0; i < 3; i++)
@@ -58,8 +58,8 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
     p.inverse_z = d8(1) / p.z;
     p.ratio_x = camera[0] * p.inverse_z;
     p.ratio_y = camera[1] * p.inverse_z;
-    p.held_x = clamp(p.ratio_x, limit.low_x, limit.high_x);
-    p.held_y = clamp(p.ratio_y, limit.low_y, limit.high_y);
+    p.clamped_x = clamp(p.ratio_x, limit.low_x, limit.high_x);
+    p.clamped_y = clamp(p.ratio_y, limit.low_y, limit.high_y);
 
     p.squared = fma(p.quat[0], p.quat[0], fma(p.quat[1], p.quat[1], fma(p.quat[2], p.quat[2], p.quat[3] * p.quat[3])));
     p.finite = p.finite + (p.squared - p.squared);
@@ -74,8 +74,8 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
     const D fx = d8(k.fx) * p.inverse_z, fy = d8(k.fy) * p.inverse_z;
     for (int i = 0; i < 3; i++) {
         const D forward = d8(k.rotation[6 + i]);
-        p.affine[i] = fx * (d8(k.rotation[i]) - p.held_x * forward);
-        p.affine[3 + i] = fy * (d8(k.rotation[3 + i]) - p.held_y * forward);
+        p.affine[i] = fx * (d8(k.rotation[i]) - p.clamped_x * forward);
+        p.affine[3 + i] = fy * (d8(k.rotation[3 + i]) - p.clamped_y * forward);
     }
     for (int j = 0; j < 3; j++) {
         const D* a = p.affine;
@@ -98,8 +98,8 @@ GRAINGS_INLINE Projected project_group(const Camera& k, const Settings& settings
 
 template <class R>
 static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
-    const ProjectArgs<R> args = given;  // a byte stored to `status` may not change these
-    // Vectors are not const here: GCC 12 keeps such as are, of two registers each, in memory.
+    const ProjectArgs<R> args = given;  // a copy, because the compiler assumes that storing bytes to `status` may change `given`
+    // Vectors are not const here: GCC 12 keeps const vectors of two registers in memory.
     const Settings& s = args.settings;
     const Inputs<R>& in = args.in;
     Limits limit = limits(args.camera, s);
@@ -109,23 +109,23 @@ static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
         D opacity, color[3];
         columns_of<1>(in.opacities, group, in.count, &opacity);
         columns_of<3>(in.colors, group, in.count, color);
-        // early: a long chain of its own, which fills the pauses of the other one
+        // early, because this dependency chain overlaps with that of the projection
         D log_opacity = log2<R>(opacity), level = s.alpha_min > 0 ? log_opacity - faintest : d8(1e30), root = sqrt(max(level, zero));
         Projected p = project_group(args.camera, s, limit, in, group);
         D footprint = (p.x - p.x) + (p.y - p.y) + (p.slope - p.slope) + (p.v - p.v) + (p.c - p.c) + (p.a - p.a);
-        D loose = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
-        D broad = sqrt(p.a), tall = sqrt(p.c), narrow = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
-        D sr = unit * narrow / p.v, sy = unit * tall * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
-        // Where q exceeds `level` nothing is drawn. The pixel decides; what follows from it only saves work, so it is
-        // widened by more than any rounding of the exponent, which is as large as `faintest` there.
+        D inputs_finite = p.finite + (opacity - opacity) + (color[0] - color[0]) + (color[1] - color[1]) + (color[2] - color[2]);
+        D std_x = sqrt(p.a), std_y = sqrt(p.c), std_x_given_y = sqrt(p.v), unit = d8(kRootHalfLog2E), radius = d8(1 / kRootHalfLog2E);
+        D sr = unit * std_x_given_y / p.v, sy = unit * std_y * p.inverse_c;  // unit / sqrt(v), unit / sqrt(c)
+        // Nothing is drawn where q exceeds `level`. The exact test is done per pixel; bounds derived here only save work, so
+        // they are widened by more than the rounding error of the exponent, whose magnitude is `faintest` there.
         D widened = min(fma(level, d8(1 + 1e-5), slack), d8(1e30));
-        D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * broad, high = reach * tall;  // of the footprint
-        // blocks with a pixel's centre in it
+        D reach = fma(root, d8(1 + 1e-5), d8(4e-3)) * radius, wide = reach * std_x, high = reach * std_y;  // half-widths of the footprint
+        // first and last pixels whose centres are inside, and their blocks
         const auto block = [](D pixel) { return floor(pixel * d8(1.0 / kBlock)); };
         D first_x = zero - floor(zero - clamp(p.x - wide - half, zero, w)), last_x = floor(clamp(p.x + wide - half, zero - one, w - one));
         D first_y = zero - floor(zero - clamp(p.y - high - half, zero, h)), last_y = floor(clamp(p.y + high - half, zero - one, h - one));
         D exact = (s.alpha_min > 0 ? root : d8(__builtin_inf())) * radius;
-        D radii[2] = {exact * broad, exact * tall};
+        D radii[2] = {exact * std_x, exact * std_y};
         D sides[4] = {block(first_x), block(last_x), block(first_y), block(last_y)};
         auto tiled = (first_x <= last_x) & (first_y <= last_y), inside = zero <= zero;
         if (s.compat) {
@@ -139,7 +139,7 @@ static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
                 box[0][i] = bound(__builtin_floor((x[i] - square[i]) / kTile), across), box[1][i] = bound(__builtin_ceil((x[i] + square[i]) / kTile), across) - 1;
                 box[2][i] = bound(__builtin_floor((y[i] - square[i]) / kTile), down), box[3][i] = bound(__builtin_ceil((y[i] + square[i]) / kTile), down) - 1;
                 hit[i] = square[i] > 0 && box[0][i] <= box[1][i] && box[2][i] <= box[3][i];
-                for (int side = 0; side < 4; side++) box[side][i] = Span::kPerTile * box[side][i] + side % 2 * (Span::kPerTile - 1);  // whole tiles
+                for (int side = 0; side < 4; side++) box[side][i] = Span::kPerTile * box[side][i] + side % 2 * (Span::kPerTile - 1);  // compat uses whole tiles
             }
             for (int side = 0; side < 4; side++) sides[side] = load<kGroup>(box[side]);
             radii[0] = radii[1] = load<kGroup>(square);
@@ -147,11 +147,11 @@ static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
         } else
             inside = (p.x - radii[0] <= w + half) & (zero - half <= p.x + radii[0]) & (p.y - radii[1] <= h + half) & (zero - half <= p.y + radii[1]);
 
-        const auto is_zero = [&](D t) { return (zero <= t) & (t <= zero); };  // and a number
+        const auto is_zero = [&](D t) { return (zero <= t) & (t <= zero); };  // false for NaN
         D largest = max(max(p.scale[0], p.scale[1]), max(p.scale[2], abs(p.z)));
-        auto finite = is_zero(loose) & (largest <= d8(s.far)), turned = d8(1e-24) <= p.squared, ahead = d8(s.near) < p.z;
+        auto finite = is_zero(inputs_finite) & (largest <= d8(s.far)), has_direction = d8(1e-24) <= p.squared, in_front = d8(s.near) < p.z;
         auto seen = d8(s.alpha_min) < opacity, bounded = is_zero(footprint);
-        auto drawn = finite & turned & ahead & seen & bounded & inside;
+        auto drawn = finite & has_direction & in_front & seen & bounded & inside;
         D center[2] = {select(drawn, p.x, zero), select(drawn, p.y, zero)};
         radii[0] = select(drawn, radii[0], zero), radii[1] = select(drawn, radii[1], zero);
         store_columns<2>(args.means2d, group, end, center), store_columns<2>(args.radii, group, end, radii);
@@ -163,17 +163,17 @@ static void project(const ProjectArgs<R>& given, int64_t begin, int64_t end) {
         auto on_tiles = drawn & tiled;
         for (D& side : sides) side = select(on_tiles, side, zero);
         put_spans(args.spans, group, end, select(on_tiles, tiles, zero), sides);
-        D status = d8(kOutside);  // the first reason of all counts
-        status = select(bounded, status, d8(kNonFinite)), status = select(seen, status, d8(kFaint)), status = select(ahead, status, d8(kBehind));
-        status = select(turned, status, d8(kZeroQuat)), status = select(finite, status, d8(kNonFinite)), status = select(drawn, d8(kDrawn), status);
+        D status = d8(kOutside);  // assigned from the last to the first reason
+        status = select(bounded, status, d8(kNonFinite)), status = select(seen, status, d8(kFaint)), status = select(in_front, status, d8(kBehind));
+        status = select(has_direction, status, d8(kZeroQuat)), status = select(finite, status, d8(kNonFinite)), status = select(drawn, d8(kDrawn), status);
         put_bytes(args.status, group, end, status);
     }
 }
 
-// Order of the sums per (tile, Gaussian); E: -dL/de of the exponent e, times the scaled distances r and s.
+// Order of the partial sums per pair. E: -dL/de of the exponent e; R, S, RR, RS, SS: E times products of r and s.
 enum Sum { kE, kR, kS, kRR, kRS, kSS, kRed, kGreen, kBlue, kDepth };
 
-constexpr int kSumsAhead = 16;  // of which the memory comes near
+constexpr int kSumsAhead = 16;  // prefetch distance
 
 template <class R>
 static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin, int64_t end) {
@@ -184,7 +184,7 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         alignas(64) double sums[kGroup][kSumStride];
         double on_[kGroup];
         bool drawn = false;
-        uint32_t first = rank(args.ranks, args.places[group]);  // of a Gaussian's pairs
+        uint32_t first = rank(args.ranks, args.places[group]);  // rank of the first Gaussian's first pair
         for (int lane = 0; lane < kGroup; lane++) {
             const int64_t i = group + lane < end ? group + lane : end - 1;
             const bool own = group + lane < end && args.status[i] == kDrawn;
@@ -196,7 +196,7 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
                 __builtin_prefetch(of_pair + kSumsAhead * kSumStride);
                 add_sums(of_pair, there, total);
             };
-            add(first, count > 0), add(first + (count > 1), count > 1);  // most have no more: no branch to guess
+            add(first, count > 0), add(first + (count > 1), count > 1);  // most Gaussians have at most two; no branch
             for (uint32_t at = first + 2; at < next; at++) add(at, true);
             first = next;
             store(sums[lane], total.first), store(sums[lane] + kGroup, total.rest);
@@ -225,16 +225,16 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         columns_of<1>(in.opacities, group, in.count, &opacity);
         const D g_opacity = total[kE] / opacity;
 
-        const D bent = g_slope * p.inverse_c, two = d8(2);
+        const D g_slope_c = g_slope * p.inverse_c, two = d8(2);
         D gn1[3], gn2[3], g_rho[3], g_affine[6];
         for (int j = 0; j < 3; j++) {
             const D t = p.m1[j] - p.slope * p.m2[j];
-            const D g1 = two * g_v * t + bent * p.m2[j];
-            const D g2 = bent * (t - p.slope * p.m2[j]) - two * p.slope * g_v * t + two * g_c * p.m2[j];
-            g_rho[j] = two * (g_v * t * t + bent * t * p.m2[j] + g_c * p.m2[j] * p.m2[j]);
+            const D g1 = two * g_v * t + g_slope_c * p.m2[j];
+            const D g2 = g_slope_c * (t - p.slope * p.m2[j]) - two * p.slope * g_v * t + two * g_c * p.m2[j];
+            g_rho[j] = two * (g_v * t * t + g_slope_c * t * p.m2[j] + g_c * p.m2[j] * p.m2[j]);
             gn1[j] = g1 * p.scale[j], gn2[j] = g2 * p.scale[j];
         }
-        D V[9];  // gradient of the rotation
+        D V[9];  // gradient with respect to the rotation
         for (int i = 0; i < 3; i++)
             for (int j = 0; j < 3; j++) V[3 * i + j] = fma(p.affine[i], gn1[j], p.affine[3 + i] * gn2[j]);
         for (int i = 0; i < 3; i++) g_affine[i] = dot3(gn1, p.rotation + 3 * i), g_affine[3 + i] = dot3(gn2, p.rotation + 3 * i);
@@ -243,11 +243,11 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         const D j00 = along(g_affine, 0), j02 = along(g_affine, 2), j11 = along(g_affine + 3, 1), j12 = along(g_affine + 3, 2);
 
         const D fx = d8(k.fx), fy = d8(k.fy), iz = p.inverse_z, zero = d8(0);
-        const D g_held_x = -(fx * iz * j02), g_held_y = -(fy * iz * j12);
-        D g_z = -(iz * iz * (fx * j00 + fy * j11 - fx * p.held_x * j02 - fy * p.held_y * j12));
-        // outside the limits the held ratio is a constant: no gradient through it
-        const D free_x = select(p.held_x <= p.ratio_x, select(p.ratio_x <= p.held_x, g_held_x, zero), zero);
-        const D free_y = select(p.held_y <= p.ratio_y, select(p.ratio_y <= p.held_y, g_held_y, zero), zero);
+        const D g_clamped_x = -(fx * iz * j02), g_clamped_y = -(fy * iz * j12);
+        D g_z = -(iz * iz * (fx * j00 + fy * j11 - fx * p.clamped_x * j02 - fy * p.clamped_y * j12));
+        // outside the limits the clamped ratio is constant and passes no gradient
+        const D free_x = select(p.clamped_x <= p.ratio_x, select(p.ratio_x <= p.clamped_x, g_clamped_x, zero), zero);
+        const D free_y = select(p.clamped_y <= p.ratio_y, select(p.ratio_y <= p.clamped_y, g_clamped_y, zero), zero);
         const D to_x = free_x + fx * g_x, to_y = free_y + fy * g_y;
         const D camera[3] = {to_x * iz, to_y * iz, g_z - iz * (to_x * p.ratio_x + to_y * p.ratio_y) + total[kDepth]};
 
@@ -259,7 +259,7 @@ static void geometry_gradient(const GeometryGradientArgs<R>& args, int64_t begin
         q[3] = two * (a * (V[2] + V[6]) + b * (V[5] + V[7]) + w * (V[3] - V[1]) - two * d * (V[0] + V[4]));
         const D radial = (q[0] * w + q[1] * a + q[2] * b + q[3] * d) * p.inverse_squared;
 
-        // what was not drawn has no gradient, whatever its lanes hold
+        // lanes of Gaussians that were not drawn may hold anything; their gradient is 0
         const auto on = zero < load<kGroup>(on_);
         const auto kept = [&](D x) { return select(on, x, zero); };
         D means[3], quats[4], log_scales[3], colors[3];

@@ -54,8 +54,8 @@ const Entry* find(const std::string& name) {
 const Entry& entry() {
     const Entry* chosen = active.load(std::memory_order_acquire);
     if (chosen) return *chosen;
-    const char* wish = std::getenv("GRAINGS_ISA");
-    if (wish && *wish) chosen = find(wish);
+    const char* requested = std::getenv("GRAINGS_ISA");
+    if (requested && *requested) chosen = find(requested);
     else
         for (const Entry& candidate : kEntries)
             if (candidate.runs_here()) { chosen = &candidate; break; }

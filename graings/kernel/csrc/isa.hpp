@@ -1,4 +1,4 @@
-// Which instruction set runs. The best one this CPU has, unless GRAINGS_ISA or use_isa() says otherwise.
+// Selection of the instruction set: the best one of this CPU, unless GRAINGS_ISA or use_isa() names another.
 #pragma once
 #include <string>
 #include <vector>

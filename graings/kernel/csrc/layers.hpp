@@ -1,5 +1,5 @@
-// A chain of linear layers with ReLU between them, a block of rows at a time, so that what a layer leaves is still
-// in cache when the next one reads it.
+// Linear layers with ReLU between them, a block of rows at a time, so that the output of a layer is still in cache when
+// the next layer reads it.
 #pragma once
 #include "simd.hpp"
 #include "types.hpp"
@@ -7,13 +7,13 @@
 namespace graings::GRAINGS_ISA {
 
 #if defined(__AVX512F__) || defined(__aarch64__)
-constexpr int kStripRows = 8;  // 8 x 2 accumulators: enough to hide the latency of two multipliers
+constexpr int kStripRows = 8;  // 8 x 2 accumulators hide the latency of two multipliers
 #else
-constexpr int kStripRows = 4;  // 16 registers hold no more
+constexpr int kStripRows = 4;  // limited by 16 registers
 #endif
 
 // c[kStripRows, vectors] = end(begin + a b) over `depth`; row m of `a` starts at a + m * a_row and advances by a_step.
-// `begin` and `end` are told the row and column of a vector of c, which starts at `row` and `column`.
+// `begin` and `end` receive the row and column of a vector of c, which starts at `row` and `column`.
 template <class R, int vectors, class Begin, class End>
 GRAINGS_INLINE void strip(int64_t depth, const R* a, int64_t a_row, int64_t a_step, const R* b, int64_t b_row, R* c, int64_t c_row, int64_t row, int64_t column, Begin begin, End end) {
     constexpr int width = kNative<R>;
@@ -33,8 +33,8 @@ GRAINGS_INLINE void strip(int64_t depth, const R* a, int64_t a_row, int64_t a_st
 }
 
 // c[rows, columns] = end(begin + a b). `rows` is a multiple of kStripRows and `columns` of kNetworkPad. Rows of b advance
-// by b_row, panels of kPanel columns by b_panel: packed, a panel keeps to its own lines of the first level of cache, where
-// rows of 128 numbers would meet in an eighth of its sets.
+// by b_row, panels of kPanel columns by b_panel: a packed panel uses all sets of the first-level cache, whereas
+// rows of 128 numbers would use an eighth of them.
 template <class R, class Begin, class End>
 GRAINGS_INLINE void multiply(int64_t rows, int64_t columns, int64_t depth, const R* a, int64_t a_row, int64_t a_step, const R* b, int64_t b_row, int64_t b_panel, R* c, int64_t c_row, Begin begin, End end) {
     constexpr int64_t width = kNative<R>;
@@ -52,7 +52,7 @@ GRAINGS_INLINE void multiply(int64_t rows, int64_t columns, int64_t depth, const
 
 GRAINGS_INLINE int64_t whole_strips(int64_t rows) { return (rows + kStripRows - 1) / kStripRows * kStripRows; }
 
-// Rows [begin, begin + rows) of `from` [., width] into `to` [., padded], zeros behind.
+// Rows [begin, begin + rows) of `from` [., width] into `to` [., padded], padded with zeros.
 template <class R>
 GRAINGS_INLINE void take_rows(const R* from, int64_t begin, int64_t rows, int64_t width, R* to, int64_t padded) {
     for (int64_t r = 0; r < rows; r++) {
@@ -61,7 +61,7 @@ GRAINGS_INLINE void take_rows(const R* from, int64_t begin, int64_t rows, int64_
     }
 }
 
-// Where the activations of the block that begins at `row` lie.
+// Pointers to the activations of the block of rows that begins at `row`.
 template <class R>
 GRAINGS_INLINE void place(const NetworkArgs<R>& args, int64_t row, R* scratch, R** levels) {
     for (int l = 0; l <= args.layers; l++) levels[l] = scratch + args.offsets[l];
@@ -70,7 +70,7 @@ GRAINGS_INLINE void place(const NetworkArgs<R>& args, int64_t row, R* scratch, R
     for (int l = 1; l < args.layers; l++) levels[l] = block + (args.offsets[l] - args.offsets[1]);
 }
 
-// The bias of the first layer in every row of a block, and what the row's group adds to it.
+// Initialises the first layer of a block of rows: the bias plus the row of `shared` of the row's group.
 template <class R>
 GRAINGS_INLINE void begin_rows(const NetworkArgs<R>& args, int64_t row, int64_t rows, int64_t strips, R* to) {
     const int64_t out = args.padded[1], width = args.widths[1];
@@ -81,8 +81,8 @@ GRAINGS_INLINE void begin_rows(const NetworkArgs<R>& args, int64_t row, int64_t 
     }
 }
 
-// The gradient of the groups' shares from that of a block's first layer. Pieces run side by side: what belongs to a
-// group that began before `begin` goes to a place of its own.
+// Adds the gradient of a block's first layer to that of `shared`. Pieces run concurrently: the part of a group that began
+// in an earlier piece is stored separately and added later.
 template <class R>
 GRAINGS_INLINE void add_to_groups(const NetworkArgs<R>& args, int64_t begin, int64_t row, int64_t rows, const R* above, R* sums) {
     const int64_t out = args.padded[1], width = args.widths[1], before = begin ? args.groups[begin - 1] : -1;
@@ -93,7 +93,7 @@ GRAINGS_INLINE void add_to_groups(const NetworkArgs<R>& args, int64_t begin, int
     }
 }
 
-// Output rows [begin, end). A NaN stays one through ReLU.
+// Output rows [begin, end). ReLU passes NaN.
 template <class R>
 static void network_values(const NetworkArgs<R>& args, int64_t begin, int64_t end, R* scratch) {
     constexpr int width = kNative<R>;
@@ -121,7 +121,7 @@ static void network_values(const NetworkArgs<R>& args, int64_t begin, int64_t en
     }
 }
 
-// Gradients of rows [begin, end): the input's go to their place, those of weights and biases are added to `sums`.
+// Gradients of rows [begin, end): those of the input are written to v_input, those of weights and biases added to `sums`.
 template <class R>
 static void network_gradient(const NetworkArgs<R>& args, int64_t begin, int64_t end, R* sums, R* scratch) {
     constexpr int width = kNative<R>;

@@ -10,15 +10,15 @@
 namespace graings {
 namespace {
 
-// Rows per piece of work and per set of partial sums: fixed, so that sums do not depend on the threads.
+// Rows per piece of work and per set of partial sums: fixed, so that sums do not depend on the number of threads.
 constexpr int64_t kPieceRows = 8 * kNetworkRows;
 
 int64_t up(int64_t n, int64_t step) { return (n + step - 1) / step * step; }
 
-// Where an element of a matrix of `rows` rows lies in panels of kPanel columns.
+// Index of an element of a matrix of `rows` rows that is stored in panels of kPanel columns.
 int64_t in_panels(int64_t row, int64_t column, int64_t rows) { return (column / kPanel * rows + row) * kPanel + column % kPanel; }
 
-// The weights as the loops want them, in both directions, with zeros in the padding.
+// The weights packed into panels, for both passes, padded with zeros.
 template <class R>
 struct Packed {
     NetworkArgs<R> args{};
@@ -74,7 +74,7 @@ template <class R>
 void evaluate(const Network<R>& network, int64_t rows, const R* input, R* output, R* hidden, int threads) {
     for (int64_t row = 0; network.shared && row < rows; row++)
         if (network.group[row] < (row ? network.group[row - 1] : 0) || network.group[row] >= network.groups)
-            throw std::invalid_argument("groups must ascend and lie within what is shared");
+            throw std::invalid_argument("groups must ascend and be rows of shared");
     Packed<R> packed(network, input, hidden, false);
     packed.args.output = output;
     const int64_t pieces = up(rows, kPieceRows) / kPieceRows;

@@ -1,4 +1,4 @@
-// A network over many rows: layout of its scratch, packing of its weights, and the split into pieces.
+// A small network evaluated on many rows: layout of scratch memory, packing of weights, and division into pieces.
 #pragma once
 #include <vector>
 #include "types.hpp"
@@ -6,8 +6,8 @@
 namespace graings {
 
 // `widths` has one entry per level, input first; weights[l] is [widths[l + 1], widths[l]] row by row. ReLU
-// between layers, none after the last. Rows may come in groups, ascending, that each add a share of `shared`
-// [groups, widths[1]] to the first layer: what all rows of a group have in common is then multiplied once.
+// between layers, none after the last. Rows may belong to groups, in ascending order, each of which
+// adds its row of `shared` [groups, widths[1]] to the first layer: inputs common to a group are then multiplied once.
 template <class R>
 struct Network {
     std::vector<int64_t> widths;
@@ -17,16 +17,16 @@ struct Network {
     int64_t groups = 0;
 };
 
-// Elements that the hidden activations of so many rows take.
+// Number of elements of the hidden activations of so many rows.
 int64_t hidden_size(const std::vector<int64_t>& widths, int64_t rows);
 
-// output [rows, widths.back()] of input [rows, widths.front()]. `hidden` may be null when no gradient is wanted.
-// Throws std::invalid_argument where groups do not ascend within their count.
+// output [rows, widths.back()] of input [rows, widths.front()]. `hidden` may be null if no gradient is needed.
+// Throws std::invalid_argument if groups do not ascend within their count.
 template <class R>
 void evaluate(const Network<R>&, int64_t rows, const R* input, R* output, R* hidden, int threads);
 
-// Gradients for `v_output`, with `hidden` as evaluate left it; `v_input` may be null, and `v_shared` where
-// nothing is shared. The same bits for any number of threads.
+// Gradients for `v_output`, with `hidden` as evaluate left it; `v_input` may be null, and `v_shared` if
+// `shared` is. The same bits for any number of threads.
 template <class R>
 void differentiate(const Network<R>&, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, R* v_shared, int threads);
 

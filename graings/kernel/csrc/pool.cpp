@@ -17,10 +17,10 @@
 namespace graings {
 namespace {
 
-// Loops follow each other closely within a step, and waking a sleeping thread takes longer than many of them: who
-// waits looks about for this long before it sleeps, first for itself, then offering its core to others in between. Who
-// gets it back late has a neighbour there and sleeps at once.
-constexpr std::chrono::microseconds kLookAbout{1500}, kAlone{60}, kLate{30};
+// Loops follow each other closely within a step, and waking a sleeping thread takes longer than many of them. A waiting
+// thread therefore spins for kSpinTime before it sleeps, after kYieldAfter with yields in between. A yield that takes
+// longer than kLateYield means that another thread uses the core; then it sleeps at once.
+constexpr std::chrono::microseconds kSpinTime{1500}, kYieldAfter{60}, kLateYield{30};
 
 void relax() {
 #if defined(__x86_64__)
@@ -31,38 +31,38 @@ void relax() {
 }
 
 template <class Done>
-bool look_about(Done done) {
+bool spin_until(Done done) {
     const auto begin = std::chrono::steady_clock::now();
-    for (auto now = begin; now < begin + kLookAbout;) {
+    for (auto now = begin; now < begin + kSpinTime;) {
         for (int i = 0; i < 16; i++) {
             if (done()) return true;
             relax();
         }
-        const bool offered = now > begin + kAlone;
-        if (offered) std::this_thread::yield();
+        const bool yielded = now > begin + kYieldAfter;
+        if (yielded) std::this_thread::yield();
         const auto before = std::exchange(now, std::chrono::steady_clock::now());
-        if (offered && now > before + kLate) break;
+        if (yielded && now > before + kLateYield) break;
     }
     return done();
 }
 
-// A thread that sleeps, and the CPU it last ran on.
+// A thread of the pool, and the CPU it last ran on.
 struct Worker {
     std::thread thread;
     std::atomic<int> cpu{-1};
 
 #ifdef __linux__
-    void stay() { cpu.store(sched_getcpu(), std::memory_order_relaxed); }
-    // Linux likes to wake a thread where it slept, even if that CPU is busy with the one who wakes it and others are
-    // idle; the two then take turns for milliseconds.
-    void make_way(int busy, const cpu_set_t& usable) {
+    void record_cpu() { cpu.store(sched_getcpu(), std::memory_order_relaxed); }
+    // Linux tends to wake a thread on the CPU where it slept, even if the waking thread runs there and other CPUs are idle;
+    // the two then share it for milliseconds.
+    void avoid_cpu(int busy, const cpu_set_t& usable) {
         if (cpu.load(std::memory_order_relaxed) != busy) return;
         cpu_set_t others = usable;
         CPU_CLR(busy, &others);
         if (CPU_COUNT(&others) > 0) pthread_setaffinity_np(thread.native_handle(), sizeof others, &others);
     }
 #else
-    void stay() {}
+    void record_cpu() {}
 #endif
 };
 
@@ -93,7 +93,7 @@ public:
 #ifdef __linux__
             cpu_set_t usable;
             if (sched_getaffinity(0, sizeof usable, &usable) == 0)
-                for (Worker& worker : workers_) worker.make_way(sched_getcpu(), usable);
+                for (Worker& worker : workers_) worker.avoid_cpu(sched_getcpu(), usable);
 #endif
             jobs_.push_back(&job);
             posted_.fetch_add(1, std::memory_order_release);
@@ -106,7 +106,7 @@ public:
             error = std::current_exception();
             job.next.store(pieces, std::memory_order_relaxed);
         }
-        look_about([&] { return job.inside.load(std::memory_order_acquire) == 0; });
+        spin_until([&] { return job.inside.load(std::memory_order_acquire) == 0; });
         std::unique_lock lock(mutex_);
         jobs_.remove(&job);
         left_.wait(lock, [&] { return job.inside == 0; });
@@ -117,7 +117,7 @@ public:
 private:
     [[noreturn]] void serve(Worker& self) {
         for (int64_t seen = 0;;) {
-            look_about([&] { return posted_.load(std::memory_order_acquire) != seen; });
+            spin_until([&] { return posted_.load(std::memory_order_acquire) != seen; });
             std::unique_lock lock(mutex_);
             Job* job = nullptr;
             wake_.wait(lock, [&] {
@@ -136,7 +136,7 @@ private:
                 error = std::current_exception();
                 job->next.store(job->pieces, std::memory_order_relaxed);
             }
-            self.stay();
+            self.record_cpu();
             lock.lock();
             if (error && !job->error) job->error = error;
             if (--job->inside == 0) left_.notify_all();

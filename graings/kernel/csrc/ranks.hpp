@@ -1,4 +1,4 @@
-// Places of which some are taken, and how many of those come before a place. Knows nothing of what lies there.
+// Rank queries: how many of the taken slots come before a slot.
 #pragma once
 #include "types.hpp"
 

@@ -1,6 +1,6 @@
-// Vectors of N numbers built from the registers of the instruction set this file is compiled for.
-// Everything lives in the namespace of that instruction set and is inlined, so that no symbol compiled for
-// a newer CPU can be picked by the linker for an older one. Products and sums are fused only where `fma` says so.
+// Vectors of N numbers, built from the registers of the instruction set that this file is compiled for.
+// Everything is in the namespace of that instruction set and inlined, so that the linker cannot use a symbol compiled
+// for a newer CPU on an older one. Products and sums are fused only by explicit `fma`.
 #pragma once
 #include <cstdint>
 #include <cstring>
@@ -43,23 +43,23 @@ GRAINGS_INLINE __mmask16 less_equal(Native<float> a, Native<float> b) { return _
 GRAINGS_INLINE __mmask8 less_equal(Native<double> a, Native<double> b) { return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LE_OQ); }
 GRAINGS_INLINE Native<float> choose(__mmask16 m, Native<float> a, Native<float> b) { return (Native<float>)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
 GRAINGS_INLINE Native<double> choose(__mmask8 m, Native<double> a, Native<double> b) { return (Native<double>)_mm512_mask_blend_pd(m, (__m512d)b, (__m512d)a); }
-GRAINGS_INLINE bool some(__mmask16 m) { return m != 0; }
-GRAINGS_INLINE bool some(__mmask8 m) { return m != 0; }
+GRAINGS_INLINE bool any_lane(__mmask16 m) { return m != 0; }
+GRAINGS_INLINE bool any_lane(__mmask8 m) { return m != 0; }
 GRAINGS_INLINE uint32_t bits_of(__mmask16 m) { return m; }
 GRAINGS_INLINE uint32_t bits_of(__mmask8 m) { return m; }
 GRAINGS_INLINE Native<float> fused(Native<float> a, Native<float> b, Native<float> c) { return (Native<float>)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
 GRAINGS_INLINE Native<double> fused(Native<double> a, Native<double> b, Native<double> c) { return (Native<double>)_mm512_fmadd_pd((__m512d)a, (__m512d)b, (__m512d)c); }
-GRAINGS_INLINE Native<float> least(Native<float> a, Native<float> b) { return (Native<float>)_mm512_min_ps((__m512)a, (__m512)b); }
-GRAINGS_INLINE Native<double> least(Native<double> a, Native<double> b) { return (Native<double>)_mm512_min_pd((__m512d)a, (__m512d)b); }
-GRAINGS_INLINE Native<float> most(Native<float> a, Native<float> b) { return (Native<float>)_mm512_max_ps((__m512)a, (__m512)b); }
-GRAINGS_INLINE Native<double> most(Native<double> a, Native<double> b) { return (Native<double>)_mm512_max_pd((__m512d)a, (__m512d)b); }
+GRAINGS_INLINE Native<float> minimum(Native<float> a, Native<float> b) { return (Native<float>)_mm512_min_ps((__m512)a, (__m512)b); }
+GRAINGS_INLINE Native<double> minimum(Native<double> a, Native<double> b) { return (Native<double>)_mm512_min_pd((__m512d)a, (__m512d)b); }
+GRAINGS_INLINE Native<float> maximum(Native<float> a, Native<float> b) { return (Native<float>)_mm512_max_ps((__m512)a, (__m512)b); }
+GRAINGS_INLINE Native<double> maximum(Native<double> a, Native<double> b) { return (Native<double>)_mm512_max_pd((__m512d)a, (__m512d)b); }
 GRAINGS_INLINE Native<double> root(Native<double> a) { return (Native<double>)_mm512_sqrt_pd((__m512d)a); }
-GRAINGS_INLINE Native<float> joined(Native<double> lo, Native<double> hi) {
+GRAINGS_INLINE Native<float> concatenated(Native<double> lo, Native<double> hi) {
     return (Native<float>)_mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps((__m512d)lo)), _mm512_cvtpd_ps((__m512d)hi), 1);
 }
 #else
 template <class T> using NativeMask = NativeBits<T>;
-GRAINGS_INLINE Native<float> joined(Native<double> lo, Native<double> hi) {
+GRAINGS_INLINE Native<float> concatenated(Native<double> lo, Native<double> hi) {
 #if defined(__AVX2__)
     return (Native<float>)_mm256_set_m128(_mm256_cvtpd_ps((__m256d)hi), _mm256_cvtpd_ps((__m256d)lo));
 #else
@@ -83,7 +83,7 @@ template <class M> GRAINGS_INLINE uint32_t bits_of(M m) {
     for (int i = 0; i < static_cast<int>(sizeof(M) / sizeof(m[0])); i++) bits |= uint32_t(m[i] != 0) << i;
     return bits;
 }
-template <class M> GRAINGS_INLINE bool some(M m) {
+template <class M> GRAINGS_INLINE bool any_lane(M m) {
 #if defined(__x86_64__)
     return bits_of(m) != 0;
 #elif defined(__aarch64__)
@@ -94,14 +94,14 @@ template <class M> GRAINGS_INLINE bool some(M m) {
     return any;
 }
 #if defined(__AVX2__)
-// In one instruction, which the compiler does not always find: a < b ? a : b and a > b ? a : b.
-GRAINGS_INLINE Native<float> least(Native<float> a, Native<float> b) { return (Native<float>)_mm256_min_ps((__m256)a, (__m256)b); }
-GRAINGS_INLINE Native<double> least(Native<double> a, Native<double> b) { return (Native<double>)_mm256_min_pd((__m256d)a, (__m256d)b); }
-GRAINGS_INLINE Native<float> most(Native<float> a, Native<float> b) { return (Native<float>)_mm256_max_ps((__m256)a, (__m256)b); }
-GRAINGS_INLINE Native<double> most(Native<double> a, Native<double> b) { return (Native<double>)_mm256_max_pd((__m256d)a, (__m256d)b); }
+// a < b ? a : b and a > b ? a : b in one instruction, which the compiler does not always emit.
+GRAINGS_INLINE Native<float> minimum(Native<float> a, Native<float> b) { return (Native<float>)_mm256_min_ps((__m256)a, (__m256)b); }
+GRAINGS_INLINE Native<double> minimum(Native<double> a, Native<double> b) { return (Native<double>)_mm256_min_pd((__m256d)a, (__m256d)b); }
+GRAINGS_INLINE Native<float> maximum(Native<float> a, Native<float> b) { return (Native<float>)_mm256_max_ps((__m256)a, (__m256)b); }
+GRAINGS_INLINE Native<double> maximum(Native<double> a, Native<double> b) { return (Native<double>)_mm256_max_pd((__m256d)a, (__m256d)b); }
 #else
-template <class V> GRAINGS_INLINE V least(V a, V b) { return a < b ? a : b; }
-template <class V> GRAINGS_INLINE V most(V a, V b) { return a > b ? a : b; }
+template <class V> GRAINGS_INLINE V minimum(V a, V b) { return a < b ? a : b; }
+template <class V> GRAINGS_INLINE V maximum(V a, V b) { return a > b ? a : b; }
 #endif
 #if defined(__AVX2__)
 GRAINGS_INLINE Native<float> fused(Native<float> a, Native<float> b, Native<float> c) { return (Native<float>)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
@@ -152,8 +152,8 @@ GRAINGS_BINARY(operator+, a.v + b.v)
 GRAINGS_BINARY(operator-, a.v - b.v)
 GRAINGS_BINARY(operator*, a.v* b.v)
 GRAINGS_BINARY(operator/, a.v / b.v)
-GRAINGS_BINARY(min, least(a.v, b.v))
-GRAINGS_BINARY(max, most(a.v, b.v))
+GRAINGS_BINARY(min, minimum(a.v, b.v))
+GRAINGS_BINARY(max, maximum(a.v, b.v))
 #undef GRAINGS_BINARY
 GRAINGS_VEC Vec<T, N> splat(T x) {
     if constexpr (kOne<T, N>) { return {x - Native<T>{}}; }
@@ -195,7 +195,7 @@ GRAINGS_VEC Vec<T, N> select(Mask<T, N> m, Vec<T, N> a, Vec<T, N> b) {
     else return {select(m.lo, a.lo, b.lo), select(m.hi, a.hi, b.hi)};
 }
 GRAINGS_VEC bool any(Mask<T, N> m) {
-    if constexpr (kOne<T, N>) return some(m.v);
+    if constexpr (kOne<T, N>) return any_lane(m.v);
     else return any(m.lo | m.hi);
 }
 // One bit per number, the first lowest.
@@ -229,7 +229,7 @@ template <class R, int N> GRAINGS_INLINE void store_as(R* p, Vec<double, N> a) {
 // Rounded to R.
 template <class R, int N> GRAINGS_INLINE Vec<R, N> rounded(Vec<double, N> a) {
     if constexpr (sizeof(R) == sizeof(double)) return a;
-    else if constexpr (kOne<R, N>) return {joined(a.lo.v, a.hi.v)};
+    else if constexpr (kOne<R, N>) return {concatenated(a.lo.v, a.hi.v)};
     else return {rounded<R>(a.lo), rounded<R>(a.hi)};
 }
 // N numbers of R, widened.
@@ -285,12 +285,12 @@ template <int N> GRAINGS_INLINE Vec<double, N> power_of_two_part(Vec<double, N> 
                             0.6931471805599453, 1.0};
     return polynomial(f, c);
 }
-// 2^x for x up to about 1; far below any contribution (2^-125, 2^-1021) it need not be exact.
+// 2^x for x up to about 1; inexact below 2^-125 (2^-1021 in double), far below any visible contribution.
 GRAINGS_VEC Vec<T, N> exp2(Vec<T, N> x) {
 #if defined(__AVX512F__)
     if constexpr (sizeof(T) == 4 && kOne<T, N>) {
-        // The fraction above the whole number below; scalef takes that number itself. Minimax on [0, 1) with the
-        // constant term fixed at 1: 8.3e-8 before rounding, 1.5e-7 after.
+        // The fraction x - floor(x); scalef uses floor(x) itself. Minimax on [0, 1) with the constant term fixed at 1:
+        // 8.3e-8 before rounding, 1.5e-7 after.
         const Vec<T, N> f{(Native<T>)_mm512_reduce_ps((__m512)x.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)};
         constexpr float c[] = {1.86713007e-3f, 9.01703032e-3f, 5.57999131e-2f, 2.4016445e-1f, 6.93151312e-1f, 1.0f};
         return {(Native<T>)_mm512_scalef_ps((__m512)polynomial(f, c).v, (__m512)x.v)};
@@ -303,7 +303,7 @@ GRAINGS_VEC Vec<T, N> exp2(Vec<T, N> x) {
     auto f = x - (shifted - splat<T, N>(magic));
     return scale_by_power(power_of_two_part(f), shifted);
 }
-// The whole number below, for |x| < 2^51
+// floor(x) for |x| < 2^51
 GRAINGS_VEC Vec<T, N> floor(Vec<T, N> x) {
     static_assert(sizeof(T) == 8);
     if constexpr (kOne<T, N>) {
@@ -318,7 +318,7 @@ GRAINGS_VEC Vec<T, N> floor(Vec<T, N> x) {
 #endif
     } else return {floor(x.lo), floor(x.hi)};
 }
-// e^x, with x limited to [-708, 709]; for R = float to 6e-11, more than it can tell
+// e^x, with x limited to [-708, 709]; for R = float to 6e-11, below its precision
 template <class R, int N> GRAINGS_INLINE Vec<double, N> exp(Vec<double, N> x) {
     constexpr double magic = 6755399441055744;
     x = clamp(x, splat<double, N>(-708), splat<double, N>(709));
@@ -341,7 +341,7 @@ template <int N> GRAINGS_INLINE void split_power(Vec<double, N> x, Vec<double, N
     if constexpr (kOne<double, N>) {
         typedef NativeBits<double> I;
         const I bits = (I)x.v, above = (bits & 0xFFFFFFFFFFFFF) > 0x6A09E667F3BCC ? I{} + 1 : I{};  // of the fraction in [1, 2)
-        constexpr double magic = 6755399441055744;  // 1.5 * 2^52, whose lowest bits count: few CPUs convert whole numbers of 64 bits
+        constexpr double magic = 6755399441055744;  // 1.5 * 2^52: conversion by addition, because few CPUs convert 64-bit integers
         power.v = (Native<double>)((bits >> 52) - 1023 + above + (I)(Native<double>{} + magic)) - magic;
         fraction.v = (Native<double>)((bits & 0xFFFFFFFFFFFFF) | ((I{} + 1023 - above) << 52));
     } else {

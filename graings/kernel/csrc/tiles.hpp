@@ -1,5 +1,5 @@
-// The pixels of one tile, composited front to back; tile_gradient.hpp goes back to front.
-// A block of 4x4 pixels is one vector of 16 lanes. Both directions evaluate alpha by the same function.
+// The pixels of one tile, composited front to back; tile_gradient.hpp is the backward pass.
+// A block of 4x4 pixels is one vector of 16 lanes. Both passes evaluate alpha by the same function.
 #pragma once
 #include "simd.hpp"
 #include "types.hpp"
@@ -9,12 +9,12 @@ namespace graings::GRAINGS_ISA {
 template <class R> using P = Vec<R, kLanes>;
 template <class R> GRAINGS_INLINE P<R> p16(R x) { return splat<R, kLanes>(x); }
 
-// Of a tile's blocks: first pixel column and row.
+// First pixel column and row of each block of a tile.
 template <class T>
 alignas(64) constexpr T kBlockX[kBlocks] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
 template <class T>
 alignas(64) constexpr T kBlockY[kBlocks] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
-// Of a block's pixels: distance from its centre.
+// Distance of each pixel of a block from the block's centre.
 template <class R>
 alignas(64) constexpr R kColumns[kLanes] = {-1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5, -1.5, -0.5, 0.5, 1.5};
 template <class R>
@@ -22,29 +22,29 @@ alignas(64) constexpr R kRows[kLanes] = {-1.5, -1.5, -1.5, -1.5, -0.5, -0.5, -0.
 
 template <class R>
 GRAINGS_INLINE void prepare(TileEntry<R>& entry, const Record<R>& record, double left, double top, int64_t number) {
-    const double sr = double(record.look.sr), sy = double(record.look.sy), dy = top + 2 - record.y, tilt = sr * record.slope;
+    const double sr = double(record.params.sr), sy = double(record.params.sy), dy = top + 2 - record.y, tilt = sr * record.slope;
     const auto all = [](double x) { return splat<double, kBlocks>(x); };
     const Vec<double, kBlocks> x = load<kBlocks>(kBlockX<double>), y = load<kBlocks>(kBlockY<double>);
     store(entry.r, rounded<R>(fma(all(sr), x, fma(all(-tilt), y, all(sr * ((left + 2 - record.x) - record.slope * dy))))));
     store(entry.s, rounded<R>(fma(all(sy), y, all(sy * dy))));
-    store(entry.lanes, fma(p16(record.look.sr), load<kLanes>(kColumns<R>), p16(R(-tilt)) * load<kLanes>(kRows<R>)));
-    entry.look = record.look, entry.lean = R(tilt), entry.number = R(number);
+    store(entry.lanes, fma(p16(record.params.sr), load<kLanes>(kColumns<R>), p16(R(-tilt)) * load<kLanes>(kRows<R>)));
+    entry.params = record.params, entry.tilt = R(tilt), entry.number = R(number);
 }
 
 // Blocks that a prepared entry may reach, one bit each. Over a block's pixel centres r changes by 1.5 (sr + |tilt|) at
-// most and s by 1.5 sy: where the squares of what then remains of |r| and |s| exceed the record's level, nothing is drawn.
-// `margin` holds more than all rounding that grows with the tile's size in r and s, here and in the pixels; what grows
-// with r and s themselves, which are small wherever it matters, is in the record's level.
+// most and s by 1.5 sy: if the sum of the squares of the remaining |r| and |s| exceeds the record's level, nothing is drawn.
+// `margin` covers the rounding errors that are proportional to sr and sy; those proportional to r and s, which are small
+// where it matters, are covered by the record's level.
 template <class R>
 GRAINGS_INLINE uint32_t reached_blocks(const TileEntry<R>& entry) {
     constexpr R margin = R(1.5) + (sizeof(R) == 4 ? R(6e-5) : R(1e-13));
-    const P<R> wide = p16(entry.look.sr), rise = p16(entry.look.sy), lean = abs(p16(entry.lean)), zero = p16(R(0));
-    const P<R> r = max(abs(load<kLanes>(entry.r)) - p16(margin) * (wide + lean), zero);
+    const P<R> wide = p16(entry.params.sr), rise = p16(entry.params.sy), tilt = abs(p16(entry.tilt)), zero = p16(R(0));
+    const P<R> r = max(abs(load<kLanes>(entry.r)) - p16(margin) * (wide + tilt), zero);
     const P<R> s = max(abs(load<kLanes>(entry.s)) - p16(margin) * rise, zero);
-    return bits(fma(r, r, s * s) <= p16(entry.look.level));
+    return bits(fma(r, r, s * s) <= p16(entry.params.level));
 }
 
-// entries[b]: which of the masks have bit b.
+// entries[b]: bit j is bit b of masks[j].
 GRAINGS_INLINE void by_block(const uint16_t (&masks)[kChunk], uint64_t (&entries)[kBlocks]) {
 #if defined(__AVX512BW__)
     const __m512i low = _mm512_loadu_si512(masks), high = _mm512_loadu_si512(masks + 32);
@@ -53,7 +53,7 @@ GRAINGS_INLINE void by_block(const uint16_t (&masks)[kChunk], uint64_t (&entries
         entries[b] = uint64_t(_mm512_test_epi16_mask(low, bit)) | uint64_t(_mm512_test_epi16_mask(high, bit)) << 32;
     }
 #elif defined(__AVX2__)
-    // The bit at the top of each mask, then of a byte for each, is its sign. Packing keeps halves of registers apart.
+    // Bit b is shifted to the sign of each mask, which survives packing to bytes. Packing works within register halves.
     __m256i low[2], high[2];
     for (int half = 0; half < 2; half++) {
         const __m256i a = _mm256_loadu_si256((const __m256i*)(masks + 32 * half)), b = _mm256_loadu_si256((const __m256i*)(masks + 32 * half + 16));
@@ -73,7 +73,7 @@ GRAINGS_INLINE void by_block(const uint16_t (&masks)[kChunk], uint64_t (&entries
 #endif
 }
 
-// masks[j]: which blocks have entry j in their list.
+// masks[j]: bit b is bit j of entries[b].
 GRAINGS_INLINE void by_entry(const uint64_t (&entries)[kBlocks], uint16_t (&masks)[kChunk]) {
 #if defined(__AVX512BW__)
     __m512i low = _mm512_setzero_si512(), high = low;
@@ -102,23 +102,23 @@ GRAINGS_INLINE void by_entry(const uint64_t (&entries)[kBlocks], uint16_t (&mask
 
 template <class R, int N = kLanes> struct Distance { Vec<R, N> r, s; };
 
-// Of the N pixels of a block from `first` on.
+// For N pixels of a block, from the pixel `first` on.
 template <int N = kLanes, class R>
 GRAINGS_INLINE Distance<R, N> distance(const TileEntry<R>& entry, int block, int first = 0) {
     const auto all = [](R x) { return splat<R, N>(x); };
-    return {load<N>(entry.lanes + first) + all(entry.r[block]), fma(all(entry.look.sy), load<N>(kRows<R> + first), all(entry.s[block]))};
+    return {load<N>(entry.lanes + first) + all(entry.r[block]), fma(all(entry.params.sy), load<N>(kRows<R> + first), all(entry.s[block]))};
 }
 
 template <class R, int N>
 GRAINGS_INLINE Vec<R, N> uncapped_alpha(const TileEntry<R>& entry, const Distance<R, N>& d) {
-    return exp2(fnma(d.r, d.r, fnma(d.s, d.s, splat<R, N>(entry.look.log_opacity))));
+    return exp2(fnma(d.r, d.r, fnma(d.s, d.s, splat<R, N>(entry.params.log_opacity))));
 }
 
-// What decides whether an entry counts in a pixel. Light so faint that no sum in R can see it counts as none: so much
-// remains that the gradient can go back through it.
-template <class R> struct Rule { R alpha_min, alpha_max, transmittance_min; };
+// Thresholds that decide whether an entry contributes to a pixel. transmittance_min is kept positive, below anything that
+// changes a sum in R, because the backward pass divides by the transmittance.
+template <class R> struct Thresholds { R alpha_min, alpha_max, transmittance_min; };
 template <class R>
-GRAINGS_INLINE Rule<R> rule(const Settings& s) {
+GRAINGS_INLINE Thresholds<R> thresholds(const Settings& s) {
     constexpr double faintest = sizeof(R) == 4 ? 1e-30 : 1e-290;
     return {R(s.alpha_min), R(s.alpha_max), R(s.transmittance_min < faintest ? faintest : s.transmittance_min)};
 }
@@ -135,7 +135,7 @@ GRAINGS_INLINE TileBox tile_box(const Camera& k, int64_t tile) {
 GRAINGS_INLINE int lane_x(int block, int lane) { return (block & 3) * 4 + (lane & 3); }
 GRAINGS_INLINE int lane_y(int block, int lane) { return (block >> 2) * 4 + (lane >> 2); }
 
-// Blocks with at least one pixel, and 1 or 0 for every lane.
+// Returns the mask of blocks with a pixel inside the image; open is 1 for every lane inside, else 0.
 template <class R>
 GRAINGS_INLINE uint32_t open_lanes(const TileBox& box, R (*open)[kLanes]) {
     uint32_t live = 0;
@@ -148,18 +148,18 @@ GRAINGS_INLINE uint32_t open_lanes(const TileBox& box, R (*open)[kLanes]) {
     return live;
 }
 
-// One step of light through a pixel. `light` is what still passes; a pixel below transmittance_min has stopped and
-// keeps it. In compat the entry that would cross is left out, and `open` remembers that the pixel has stopped.
+// One compositing step. `light` is the transmittance; a pixel below transmittance_min has stopped and keeps it. In compat
+// mode the entry that would cross the threshold is not blended, and `open` is 0 for pixels that have stopped.
 template <class R> struct Step {
     P<R> weight;             // of the entry
     Mask<R, kLanes> counts;  // whether the pixel had not stopped
-    Mask<R, kLanes> seen;    // and whether it sees anything of the entry
+    Mask<R, kLanes> seen;    // and whether the entry's alpha reaches alpha_min
 };
 
 template <class R, bool Compat>
-GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& open) {
-    const P<R> zero = p16(R(0)), stop = p16(rule.transmittance_min), capped = min(raw, p16(rule.alpha_max));
-    const auto drawn = p16(rule.alpha_min) <= raw;
+GRAINGS_INLINE Step<R> blend(P<R> raw, const Thresholds<R>& thresholds, P<R>& light, P<R>& open) {
+    const P<R> zero = p16(R(0)), stop = p16(thresholds.transmittance_min), capped = min(raw, p16(thresholds.alpha_max));
+    const auto drawn = p16(thresholds.alpha_min) <= raw;
     if constexpr (Compat) {
         const P<R> alpha = select(drawn & (zero < open), capped, zero), next = light * (p16(R(1)) - alpha);
         open = select(next < stop, zero, open);
@@ -168,7 +168,7 @@ GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& o
         light = select(counts, next, light);
         return {weight, counts, counts & drawn};
     } else {
-        // what waits for the entry before is kept short: one comparison and one product
+        // only one comparison and one product depend on the previous entry
         const P<R> alpha = select(drawn, capped, zero), passed = p16(R(1)) - alpha;
         const auto counts = stop <= light;
         const P<R> weight = select(counts, alpha * light, zero);
@@ -177,15 +177,15 @@ GRAINGS_INLINE Step<R> blend(P<R> raw, const Rule<R>& rule, P<R>& light, P<R>& o
     }
 }
 
-// One row of a tile's pixels, as far as they lie in the image.
+// Writes the part of one pixel row of a tile that is inside the image.
 template <int Channels, class R>
 GRAINGS_INLINE void put_row(const R* row, const TileBox& box, int y, int64_t width, R* image) {
     R* to = image + Channels * ((box.top + y) * width + box.left);
-    if (box.width == kTile) std::memcpy(to, row, sizeof(R) * Channels * kTile);  // of a known size: a few stores
+    if (box.width == kTile) std::memcpy(to, row, sizeof(R) * Channels * kTile);  // constant size: a few stores
     else std::memcpy(to, row, sizeof(R) * size_t(Channels * box.width));
 }
 
-// Blocks become rows of pixels.
+// Converts blocks to rows of pixels.
 template <int Channels, class R>
 GRAINGS_INLINE void to_rows(const R (*blocks)[kBlocks][kLanes], const TileBox& box, int64_t width, R* image) {
     for (int y = 0; y < box.height; y++) {
@@ -201,7 +201,7 @@ constexpr int kSmall = 3;  // entries that touch fewer blocks, on average, are s
 template <class R, bool Compat, bool Keep, bool Depth>
 GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end, TileEntry<R>* chunk) {
     const TileBox box = tile_box(args.camera, tile);
-    const Rule<R> limits = rule<R>(args.settings);
+    const Thresholds<R> limits = thresholds<R>(args.settings);
     alignas(64) R open[kBlocks][kLanes], light[kBlocks][kLanes], last[kBlocks][kLanes], channels[4][kBlocks][kLanes];
     uint32_t live = open_lanes(box, open);
     std::memcpy(light, open, sizeof light);
@@ -210,7 +210,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
     std::memset(channels, 0, sizeof channels);
 
     Pair* const pairs = args.pairs;
-    uint8_t* const shown = args.shown;  // as far as the compiler knows, a byte stored there may change `args`
+    uint8_t* const shown = args.shown;  // a copy: the compiler assumes that storing a byte may change `args`
     int64_t k = args.begin[tile];
     const int64_t end = args.begin[tile + 1], start = k, soon_end = args.begin[next_end];
     int32_t items = 0;
@@ -219,10 +219,10 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
         const int n = int(end - k < kChunk ? end - k : kChunk);
         uint16_t masks[kChunk] = {};
         uint64_t lists[kBlocks];
-        int touched = 0;  // blocks, by all entries
+        int touched = 0;  // (entry, block) pairs
         for (int j = 0; j < n; j++) {
             Pair& pair = pairs[k + j];
-            if (k + j + kChunk < soon_end) __builtin_prefetch(&args.records[pairs[k + j + kChunk].id]);  // maybe the next tile's
+            if (k + j + kChunk < soon_end) __builtin_prefetch(&args.records[pairs[k + j + kChunk].id]);  // possibly of the next tile
             if (Keep && shown) __builtin_prefetch(shown + pair.place, 1);
             if (pair.mask &= live) {
                 prepare(chunk[j], args.records[pair.id], double(box.left), double(box.top), k + j - start);
@@ -234,7 +234,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
         items += touched;
         by_block(masks, lists);
         const auto walk = [&](int b, auto watch) {
-            [[maybe_unused]] uint64_t unseen = 0;  // entries of which no pixel of the block sees anything
+            [[maybe_unused]] uint64_t unseen = 0;  // entries that no pixel of the block draws
             P<R> t = load<kLanes>(light[b]), going = load<kLanes>(open[b]);
             [[maybe_unused]] P<R> latest = Keep ? load<kLanes>(last[b]) : t;
             P<R> red = load<kLanes>(channels[0][b]), green = load<kLanes>(channels[1][b]);
@@ -256,10 +256,10 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
                 raw = next;
                 if constexpr (Keep) latest = select(counts, p16(entry.number), latest);
                 if constexpr (watch) unseen |= uint64_t(!any(seen)) << j;
-                red = fma(weight, p16(entry.look.red), red);
-                green = fma(weight, p16(entry.look.green), green);
-                blue = fma(weight, p16(entry.look.blue), blue);
-                if constexpr (Depth) depth = fma(weight, p16(entry.look.depth), depth);
+                red = fma(weight, p16(entry.params.red), red);
+                green = fma(weight, p16(entry.params.green), green);
+                blue = fma(weight, p16(entry.params.blue), blue);
+                if constexpr (Depth) depth = fma(weight, p16(entry.params.depth), depth);
             }
             store(light[b], t), store(open[b], going);
             if constexpr (Keep) store(last[b], latest);
@@ -267,11 +267,12 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
             if constexpr (Depth) store(channels[3][b], depth);
             if constexpr (watch) lists[b] &= ~(unseen | list);
             if (any(Compat ? p16(R(0)) < going : p16(limits.transmittance_min) <= t)) return;
-            live &= ~(1u << b);  // all its pixels have stopped: the gradient need not look at the rest
+            live &= ~(1u << b);  // all its pixels have stopped: the gradient skips the rest
             items -= __builtin_popcountll(list);
             for (; list; list &= list - 1) pairs[k + __builtin_ctzll(list)].mask &= ~(1u << b);
         };
-        // Of what is small many a block has nothing to show. Watching for it costs less than the way back through it.
+        // Small Gaussians miss all pixel centres of many blocks. Detecting that costs less than evaluating those blocks
+        // again in the backward pass.
         if (Keep && touched < kSmall * n) {
             for (int b = 0; b < kBlocks; b++)
                 if (lists[b]) walk(b, std::true_type());
@@ -280,7 +281,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
         } else
             for (int b = 0; b < kBlocks; b++)
                 if (lists[b]) walk(b, std::false_type());
-        if (Keep && shown)  // what the gradient has to look at moves together
+        if (Keep && shown)  // drawn pairs move to the front of the list
             for (int j = 0; j < n; j++) {
                 const Pair pair = pairs[k + j];
                 shown[pair.place] = pair.mask != 0;
@@ -306,7 +307,7 @@ GRAINGS_INLINE void draw(const TileArgs<R>& args, int64_t tile, int64_t next_end
     if constexpr (Depth) to_rows<1>(channels + 3, box, args.camera.width, args.depth);
 }
 
-// A tile that nothing touches.
+// A tile without entries.
 template <class R>
 GRAINGS_INLINE void draw_background(const TileArgs<R>& args, int64_t tile) {
     args.kept[tile] = args.items[tile] = 0;

@@ -1,5 +1,4 @@
-// Plain data shared by all parts of the kernel. No code, no ownership: what is here has the same layout
-// for every instruction set.
+// Plain data shared by all parts of the kernel, with the same layout for every instruction set.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -11,8 +10,8 @@ constexpr int kBlock = 4;    // edge of a block in pixels
 constexpr int kBlocks = 16;  // per tile, row by row
 constexpr int kLanes = 16;   // pixels per block, row by row
 constexpr int kSums = 10;    // partial sums per (tile, Gaussian)
-constexpr int kSumStride = 16;  // numbers from one pair's sums to the next: a cache line in single precision
-constexpr int64_t kLongestSide = int64_t(kBlock) << 16;  // of an image: blocks are counted in 16 bits
+constexpr int kSumStride = 16;  // stride between the sums of two pairs: a cache line in single precision
+constexpr int64_t kMaxImageSide = int64_t(kBlock) << 16;  // of an image: block indices have 16 bits
 
 struct Camera {
     double rotation[9];  // world to camera, row by row
@@ -23,7 +22,7 @@ struct Camera {
 
 struct Settings {
     double alpha_min, transmittance_min, alpha_max, blur, near, far, frustum_margin;
-    bool compat;  // exclusive stop and the square of three standard deviations, as public rasterizers do
+    bool compat;  // exclusive stop and square footprint of three standard deviations, as in public rasterizers
 };
 
 enum Status : uint8_t { kDrawn, kNonFinite, kZeroQuat, kBehind, kFaint, kOutside, kStatuses };
@@ -32,17 +31,17 @@ enum Status : uint8_t { kDrawn, kNonFinite, kZeroQuat, kBehind, kFaint, kOutside
 // alpha = 2^(log_opacity - q) with q = (sr (dx - slope dy))^2 + (sy dy)^2; nothing is drawn where q exceeds `level`.
 // Logarithms are of base 2.
 template <class R>
-struct Look {
+struct SplatParameters {
     R sr, sy, log_opacity, red, green, blue, depth, level;
 };
 template <class R>
 struct alignas(64) Record {
     double x, y, slope;
-    Look<R> look;
+    SplatParameters<R> params;
 };
 static_assert(sizeof(Record<float>) == 64);
 
-// The rectangle of blocks that a Gaussian may touch, from the image's left and top, and how many pairs with tiles it has.
+// The rectangle of blocks that a Gaussian may touch, counted from the image's top left, and its number of tiles.
 struct Span {
     uint32_t count;
     uint16_t left, right, top, bottom;
@@ -57,25 +56,25 @@ struct Span {
 
 // A Gaussian on a tile.
 struct Pair {
-    uint32_t key;    // of its depth; once drawn, its number in the tile
+    uint32_t key;    // leading bits of the depth; after drawing, the number of the entry in its tile
     uint32_t id;
-    uint32_t place;  // in the Gaussians' order: its number among the pairs of all
+    uint32_t place;  // its slot: its number among all pairs in the order of the Gaussians
     uint32_t mask;   // blocks of the tile that it may touch, one bit each
 };
 
-// Of 64 places: which are taken, and how many are before the first of them.
+// Of 64 slots: which are taken, and how many taken slots precede them.
 struct Ranks {
     uint64_t taken;
     uint32_t before;
 };
 
-// A record seen from one tile. The scaled distances of a block's pixel are r = r[block] + lanes[pixel] and
-// s = s[block] + sy * row. Those of the blocks' centres are found in float64, where large numbers may cancel.
+// A record relative to one tile. The scaled distances of a pixel are r = r[block] + lanes[pixel] and
+// s = s[block] + sy * row. Those of the block centres are computed in float64, because large numbers cancel.
 template <class R>
 struct alignas(64) TileEntry {
     R lanes[kLanes], r[kBlocks], s[kBlocks];
-    Look<R> look;
-    R lean;    // sr slope
+    SplatParameters<R> params;
+    R tilt;    // sr * slope
     R number;  // of the entry in its tile
 };
 
@@ -95,11 +94,11 @@ struct ProjectArgs {
     Record<R>* records;
     uint8_t* status;
     double* depths;
-    Span* spans;  // the count is that of all tiles in the rectangle
+    Span* spans;  // with the number of tiles of the rectangle as count
     R *means2d, *radii;
 };
 
-// What the tile stage reads: entries of tile t are [begin[t], begin[t+1]), in depth order.
+// Arguments of the tile stage: entries of tile t are [begin[t], begin[t+1]), in depth order.
 template <class R>
 struct TileArgs {
     Camera camera;
@@ -107,12 +106,12 @@ struct TileArgs {
     const R* background;
     const Record<R>* records;
     const int64_t* begin;
-    Pair* pairs;          // for the gradient, those shown move to the front, with their number in the tile as key
-    int32_t* kept;        // entries per tile that were shown: by a block whose pixels had not all stopped
+    Pair* pairs;          // for the gradient, drawn pairs move to the front of a tile's list, with their number as key
+    int32_t* kept;        // drawn entries per tile, that is those that some unfinished block has evaluated
     int32_t* items;       // (entry, block) pairs per tile
-    uint8_t* shown;       // [place] for the gradient, or null: whether a block has shown the pair; 0 before
-    R *light, *last;      // [tile, block, lane] for the gradient, or null: what passes all entries, and the number of
-                          // the last entry of the tile that counted
+    uint8_t* shown;       // [slot] for the gradient, or null: whether a block has drawn the pair; initially 0
+    R *light, *last;      // [tile, block, lane] for the gradient, or null: final transmittance, and the number of the
+                          // last entry of the tile that contributed
     R *color, *alpha, *depth;  // depth may be null
 };
 
@@ -120,8 +119,8 @@ template <class R>
 struct TileGradientArgs {
     TileArgs<R> tiles;
     const R *v_color, *v_alpha, *v_depth;  // the last two may be null
-    const Ranks* ranks;                // of the places of pairs that were shown
-    R* sums;                           // [rank, kSums], of those alone
+    const Ranks* ranks;                // of the slots of drawn pairs
+    R* sums;                           // [rank, kSums]
     double* v_background;              // [tile, 3] or null
 };
 
@@ -131,56 +130,64 @@ struct GeometryGradientArgs {
     Settings settings;
     Inputs<R> in;
     const uint8_t* status;
-    const uint32_t* places;     // of each Gaussian's pairs: where they begin; one more at the end
-    const Ranks* ranks;         // of the places of pairs that were shown
+    const uint32_t* places;     // slot of each Gaussian's first pair, and the end of the last
+    const Ranks* ranks;         // of the slots of drawn pairs
     const R* sums;
     R *v_means, *v_quats, *v_log_scales, *v_opacities, *v_colors, *v_offset;  // v_offset may be null
 };
+
+// SSIM as 3D Gaussian Splatting defines it; graings/constants.py holds the same numbers, and a test compares the two.
+// Compiled in, because the loops over the window are unrolled.
+constexpr int kSsimRadius = 5;  // of the window, in pixels
+constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
+// exp(-k^2 / (2 sigma^2)) for k = 0..5 with sigma 1.5, normalised over the 11 taps.
+constexpr double kSsimTaps[kSsimRadius + 1] = {0.2660117248617943,   0.21300553771125366,  0.1093606895097,
+                                               0.03600077212843082, 0.007598758135239184, 0.0010283800844791099};
 
 struct Range { int64_t begin, end; };  // [begin, end)
 
 template <class R>
 struct SsimArgs {
     int64_t height, width;
-    int64_t row;    // numbers from one row of image, target and gradient to the next
+    int64_t row;    // row stride of image, target and gradient, in numbers
     const R *image, *target;
-    const Range* windows;  // of each row, the numbers whose window sees a difference: elsewhere similarity is 1
-    const Range* pulled;   // and those that such a window pulls at: elsewhere the gradient is 0, and is not written
+    const Range* windows;  // of each row, the numbers whose window contains a difference: elsewhere SSIM is 1
+    const Range* affected;   // and those inside such a window: elsewhere the gradient is 0, and is not written
     R* gradient;    // [height, width, 3] or null
-    R* maps;        // three planes [height, width, 3]: what the gradient filters back
-    double* sums;   // per band: of the similarity, of |image - target| and of its square
-    R similarity, absolute, squared;  // what each number counts in the gradient
+    R* maps;        // three planes [height, width, 3], which the gradient filters
+    double* sums;   // per band: sums of SSIM, of |image - target| and of its square
+    R similarity, absolute, squared;  // weight of each number in the gradient
 };
 
 constexpr int kMaxLayers = 16;
-constexpr int64_t kNetworkRows = 64;  // rows at a time: their activations fit the second level of cache
+constexpr int64_t kNetworkRows = 64;  // rows per block: their activations fit into the second-level cache
 constexpr int64_t kNetworkPad = 16;   // widths are padded to a multiple of this
-constexpr int64_t kPanel = 32;        // weights lie in panels of so many columns, each row behind the one before
+constexpr int64_t kPanel = 32;        // weights are stored in panels of this many columns, row by row
 
 // A network packed for the loops. Level 0 is the input, level `layers` the output.
 template <class R>
 struct NetworkArgs {
     int layers;
     int64_t widths[kMaxLayers + 1], padded[kMaxLayers + 1], widest;
-    int64_t offsets[kMaxLayers + 2];  // of each level's activations in the scratch, then of two gradients
-    int64_t weight_at[kMaxLayers], bias_at[kMaxLayers];  // in a set of partial sums
+    int64_t offsets[kMaxLayers + 2];  // of each level's activations in the scratch memory, then of two gradients
+    int64_t weight_at[kMaxLayers], bias_at[kMaxLayers];  // offsets in a set of partial sums
     const R* forward[kMaxLayers];   // [in, out], in panels
-    const R* backward[kMaxLayers];  // [out, in], in panels; of the gradient only
+    const R* backward[kMaxLayers];  // [out, in], in panels; only for the gradient
     const R* biases[kMaxLayers];
     const R *input, *v_output;
     R *output, *v_input;  // v_input may be null
     const R* shared;        // [groups, widths[1]], added to the first layer of the rows of a group; or null
     const int64_t* groups;  // of each row, ascending
     R* v_shared;
-    int64_t first_group_at;  // in a set of partial sums: the part of a group that began in the piece before
-    R* hidden;            // the hidden levels of every block, kept for the gradient; null where none is wanted
+    int64_t first_group_at;  // offset in a set of partial sums: the part of a group that began in an earlier piece
+    R* hidden;            // the hidden levels of every block, kept for the gradient; may be null
 };
 
 // The functions compiled once per instruction set.
 template <class R>
 struct Kernels {
     void (*project)(const ProjectArgs<R>&, int64_t begin, int64_t end);
-    void (*draw_tile)(const TileArgs<R>&, int64_t tile, int64_t next_end, TileEntry<R>* chunk);  // the same thread draws those before next_end
+    void (*draw_tile)(const TileArgs<R>&, int64_t tile, int64_t next_end, TileEntry<R>* chunk);  // the same thread draws the tiles before next_end
     void (*tile_gradient)(const TileGradientArgs<R>&, int64_t tile);
     void (*geometry_gradient)(const GeometryGradientArgs<R>&, int64_t begin, int64_t end);
     void (*ssim_values)(const SsimArgs<R>&, int64_t band, int64_t begin, int64_t end, R* scratch);

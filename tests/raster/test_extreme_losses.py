@@ -1,7 +1,4 @@
-"""The photometric loss on images that leave it nothing to divide by, or are none: cases C of the test matrix.
-
-C01 and C03 are tests of `test_photometric` and `tests.test_metrics`, which also holds the metrics' part of C04.
-"""
+"""The photometric loss on extreme images: flat, black against white, non-finite, equal to their target."""
 
 from __future__ import annotations
 
@@ -11,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from graings.constants import SSIM_C2
 from graings.raster.photometric import photometric, ssim
-from graings.raster.photometric_reference import C2
 from graings.raster.rasterize import rasterize
 from tests.raster.comparison import BACKGROUND, UNIT_ROUNDOFF
 from tests.scenes import FLOATS, cast, overlapping
@@ -29,8 +26,8 @@ def loss_and_gradient(image: Tensor, target: Tensor, weight: float = WEIGHT) -> 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("level", [0.0, 0.6, 1.0])
-def test_flat_images_lose_nothing(level: float, dtype: torch.dtype, isa: str) -> None:
-    """C02: flat images that nearly agree; E[x^2] - E[x]^2 is below 0 for some of them."""
+def test_nearly_equal_flat_images_have_no_loss(level: float, dtype: torch.dtype, isa: str) -> None:
+    """Flat images that nearly agree; E[x^2] - E[x]^2 is below 0 for some of them."""
     image = torch.full((24, 24, 3), level, dtype=dtype)
     for target in (image, image + 1e-7):
         value, gradient = loss_and_gradient(image, target)
@@ -42,23 +39,23 @@ def test_flat_images_lose_nothing(level: float, dtype: torch.dtype, isa: str) ->
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (17, 33)])
-def test_black_against_white_is_finite_and_as_bad_as_it_gets(
+def test_black_against_white_has_the_largest_loss_and_a_finite_gradient(
     size: tuple[int, int], dtype: torch.dtype, isa: str
 ) -> None:
-    """C04: the loss of the worst pair there is."""
+    """The largest possible loss."""
     black, white = torch.zeros(*size, 3, dtype=dtype), torch.ones(*size, 3, dtype=dtype)
     for image, target in ((black, white), (white, black)):
         value, gradient = loss_and_gradient(image, target)
         assert 0.99 <= value.item() <= 1
         assert gradient.isfinite().all()
-        assert (gradient * (target - image)).sum() < 0  # towards the target is down
+        assert (gradient * (target - image)).sum() < 0  # a step towards the target reduces the loss
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("where", ["image", "target"])
 @pytest.mark.parametrize("weight", [0.0, WEIGHT, 1.0])
-def test_a_number_that_is_none_is_seen_in_the_loss(weight: float, where: str, bad: float, isa: str) -> None:
-    """C04: a finite loss of an image with a hole would hide the hole from whoever checks the loss."""
+def test_a_non_finite_pixel_gives_a_non_finite_loss(weight: float, where: str, bad: float, isa: str) -> None:
+    """A finite loss of an image with a hole would hide the hole from checks of the loss."""
     image, target = torch.full((20, 20, 3), 0.4), torch.full((20, 20, 3), 0.5)
     (image if where == "image" else target)[7, 9, 1] = bad
     value, _ = loss_and_gradient(image, target, weight)
@@ -67,8 +64,8 @@ def test_a_number_that_is_none_is_seen_in_the_loss(weight: float, where: str, ba
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("weight", [0.0, WEIGHT, 1.0])
-def test_a_picture_that_equals_its_target_moves_nothing(weight: float, dtype: torch.dtype, isa: str) -> None:
-    """C05: render == target. The absolute difference is flat there to the bit, SSIM to the rounding of its terms."""
+def test_an_image_equal_to_its_target_has_no_gradient(weight: float, dtype: torch.dtype, isa: str) -> None:
+    """The gradient of L1 is exactly 0 there, and that of SSIM up to the rounding of its terms."""
     batch, camera = overlapping()
     batch = cast(batch, dtype)
     leaves = {name: getattr(batch, name).clone().requires_grad_() for name in FLOATS}
@@ -83,7 +80,7 @@ def test_a_picture_that_equals_its_target_moves_nothing(weight: float, dtype: to
         assert value.item() == 0
         assert all((gradient == 0).all() for gradient in gradients.values())
     # 24 roundings of moments <= 1, seen through the smallest divisor C2, as in `test_photometric`
-    bound = 24 * (UNIT_ROUNDOFF if dtype == torch.float32 else 2.0**-53) / C2
+    bound = 24 * (UNIT_ROUNDOFF if dtype == torch.float32 else 2.0**-53) / SSIM_C2
     assert abs(value.item()) <= weight * bound
     # what one grey level of noise would send back is the measure of a gradient that should not be there
     noise = torch.randn(color.shape, generator=torch.Generator().manual_seed(0), dtype=dtype) / 255

@@ -1,4 +1,4 @@
-"""What the cases of the test matrix share: derived bounds, central differences, and the peak of memory."""
+"""Shared by the tests of extreme cases: derived bounds, central differences, and peak memory."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from tests.raster.comparison import BACKGROUND, UNIT_ROUNDOFF, decisions, draw, 
 from tests.raster.evidence import within
 from tests.scenes import FLOATS, Scene, cast
 
-# Nothing truncated: every function of the inputs is smooth, and the order is the only decision left.
+# No truncation: the image is a smooth function of all inputs while the depth order stays the same.
 SMOOTH = RasterSettings(alpha_min=0.0, transmittance_min=0.0)
 
 # Per group of parameters: fifty times the 4e-7 measured for float32 pixels over float64 geometry.
 GRADIENT_NORM = 2e-5
 GRADIENT_LARGEST = 1e-4
 
-# One decision that falls the other way changes a pixel by at most this.
+# A pixel changes by at most this if rounding reverses one threshold decision.
 FLIP = 1 / 255 + 1e-4
 
 
 def forward_bound(contributors: int) -> float:
-    """Alpha carries at most 30 units of roundoff and passes through once; sums over n contributors add sqrt(n)."""
+    """Alpha has at most 30 units of roundoff; sums over n contributors add sqrt(n)."""
     return (32 + 4 * math.sqrt(contributors)) * UNIT_ROUNDOFF
 
 
 def assert_single_precision_holds(scene: Scene) -> None:
-    """The kernel in float32 against the float64 oracle of the same float32 inputs, images and gradients."""
+    """Compares the float32 kernel with the float64 oracle on the same float32 inputs, images and gradients."""
     batch, camera = scene
     single = cast(batch, torch.float32)
     exact = cast(single, torch.float64)
@@ -67,8 +67,8 @@ def central_differences(
     background = torch.tensor(BACKGROUND, dtype=torch.float64)
 
     def value(moved: Gaussians) -> float:
-        picture = reference.rasterize(moved, camera, background, settings=SMOOTH)
-        image = torch.cat([picture.color, picture.alpha[..., None], picture.depth[..., None]], 2)
+        result = reference.rasterize(moved, camera, background, settings=SMOOTH)
+        image = torch.cat([result.color, result.alpha[..., None], result.depth[..., None]], 2)
         return (image * cotangent).sum().item()
 
     gradients = {}
@@ -88,11 +88,11 @@ def central_differences(
 
 
 class PeakMemory:
-    """The most memory that this process holds while the block runs; Linux only, elsewhere the test is skipped."""
+    """Peak resident memory of this process during the block; on systems other than Linux the test is skipped."""
 
     def __enter__(self) -> PeakMemory:
         try:
-            Path("/proc/self/clear_refs").write_text("5")  # the high-water mark starts anew
+            Path("/proc/self/clear_refs").write_text("5")  # resets the high-water mark
         except OSError:
             pytest.skip("the high-water mark of memory cannot be reset here")
         self.before = _status("VmRSS")
@@ -107,6 +107,6 @@ class PeakMemory:
 
 
 def _status(field: str) -> int:
-    """A line of the process' status, in bytes."""
+    """A field of the process status, in bytes."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{field}:"))

@@ -1,4 +1,4 @@
-"""The gradient goes back to front and finds the light before an entry by division: through deep and opaque stacks."""
+"""The backward pass obtains transmittance by division: deep and opaque stacks of Gaussians."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.raster.comparison import UNIT_ROUNDOFF, draw, relative, upstream
 from tests.raster.evidence import within
 from tests.scenes import FLOATS, cast, gaussians, overlapping, pinhole
 
-ENDLESS = RasterSettings(alpha_min=0.0, transmittance_min=0.0)
+UNTRUNCATED = RasterSettings(alpha_min=0.0, transmittance_min=0.0)
 
 
 def stack(count: int, opacity: tuple[float, float], behind: int = 0) -> Gaussians:
@@ -31,10 +31,10 @@ def stack(count: int, opacity: tuple[float, float], behind: int = 0) -> Gaussian
 @pytest.mark.parametrize(
     ("count", "opacity", "behind"), [(900, (0.009, 0.011), 0), (300, (0.005, 0.9), 0), (300, (0.009, 0.011), 5)]
 )
-def test_weights_on_the_way_back_are_those_of_the_way_forth(
+def test_weights_of_the_backward_pass_are_those_of_the_forward_pass(
     count: int, opacity: tuple[float, float], behind: int
 ) -> None:
-    """With an upstream of 1 the gradient of a colour is the sum of its weights, off by two roundings per entry."""
+    """With an upstream gradient of 1 the gradient of a colour is its sum of weights, up to two roundings per entry."""
     batch, camera = cast(stack(count, opacity, behind), torch.float32), pinhole(16, 16)
     ones = torch.zeros(16, 16, 5, dtype=torch.float64)
     ones[..., 0] = 1
@@ -46,34 +46,34 @@ def test_weights_on_the_way_back_are_those_of_the_way_forth(
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5), (torch.float64, 1e-9)])
-def test_a_wall_without_a_stop_has_the_gradient_of_its_front(dtype: torch.dtype, bound: float) -> None:
-    """400 layers of alpha 0.99 leave 1e-800 of the light: below every number, and nothing may divide by it."""
+def test_an_opaque_wall_without_a_stop_has_the_gradient_of_its_front(dtype: torch.dtype, bound: float) -> None:
+    """400 layers of alpha 0.99 have a transmittance of 1e-800, which underflows; nothing may divide by it."""
     batch, camera = cast(stack(400, (0.99, 0.99)), dtype), pinhole(16, 16)
     cotangent = upstream(camera)
-    ours = draw(rasterize, batch, camera, cotangent, settings=ENDLESS)
-    oracle = draw(reference.rasterize, cast(batch, torch.float64), camera, cotangent, settings=ENDLESS)
+    ours = draw(rasterize, batch, camera, cotangent, settings=UNTRUNCATED)
+    oracle = draw(reference.rasterize, cast(batch, torch.float64), camera, cotangent, settings=UNTRUNCATED)
     for name in FLOATS:
         assert ours.gradients[name].isfinite().all(), name
         within(f"{dtype} gradient of {name}", relative(ours.gradients[name], oracle.gradients[name]), bound)
 
 
-def test_a_background_without_a_gradient_leaves_the_others_as_they_are() -> None:
+def test_a_background_without_a_gradient_does_not_change_other_gradients() -> None:
     batch, camera = overlapping()
-    found = {}
-    for wanted in (True, False):
+    gradients = {}
+    for requires_grad in (True, False):
         leaf = batch.means.clone().requires_grad_()
-        background = torch.full((3,), 0.3, dtype=torch.float64, requires_grad=wanted)
+        background = torch.full((3,), 0.3, dtype=torch.float64, requires_grad=requires_grad)
         image = rasterize(replace(batch, means=leaf), camera, background).color
         (image * upstream(camera)[..., :3]).sum().backward()
-        found[wanted] = leaf.grad
-        assert (background.grad is not None) == wanted
-    assert found[True] is not None
-    assert found[False] is not None
-    assert torch.equal(found[True], found[False])
+        gradients[requires_grad] = leaf.grad
+        assert (background.grad is not None) == requires_grad
+    assert gradients[True] is not None
+    assert gradients[False] is not None
+    assert torch.equal(gradients[True], gradients[False])
 
 
-def test_silent_blocks_have_no_say_and_a_nan_is_not_silence() -> None:
-    """Where the upstream is 0 nothing is walked; the result is that of a walk, and bad numbers stay visible."""
+def test_blocks_without_upstream_gradient_are_skipped_but_nan_is_not() -> None:
+    """Blocks whose upstream gradient is 0 are skipped without changing the result; a NaN there shows."""
     batch, camera = overlapping()
     everywhere, corner = upstream(camera), torch.zeros_like(upstream(camera))
     corner[:6, :6] = everywhere[:6, :6]
@@ -96,6 +96,6 @@ def test_silent_blocks_have_no_say_and_a_nan_is_not_silence() -> None:
         ({"blur": -1.0}, "blur >= 0 and frustum_margin >= -1 expected, got -1.0"),
     ],
 )
-def test_settings_no_picture_can_be_drawn_with_are_named(change: dict[str, float], message: str) -> None:
+def test_invalid_settings_are_refused_by_name(change: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(DEFAULT_SETTINGS, **change)  # type: ignore[arg-type]

@@ -1,6 +1,6 @@
-"""Gaussians and cameras at the edge of what arithmetic allows: cases A of the test matrix.
+"""Gaussians and cameras with extreme values: scales, opacities, non-finite numbers, near plane, deep stacks, gradients.
 
-A01, A03, A07, A10, A11, A13, A16 and A17 are scenes of `test_agreement` and tests of `test_invariants`.
+Further extreme scenes are in `test_agreement` and `test_invariants`.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RenderResult
 from tests.raster.comparison import BACKGROUND, draw, relative, upstream
 from tests.raster.evidence import within
-from tests.raster.matrix import SMOOTH, assert_single_precision_holds, central_differences, forward_bound
+from tests.raster.extremes import SMOOTH, assert_single_precision_holds, central_differences, forward_bound
 from tests.scenes import FLOATS, cast, gaussians, pinhole, rows
 
 DTYPES = [torch.float32, torch.float64]
 SLOTS = [(field, column) for field, width in zip(FLOATS, (3, 4, 3, 1, 3), strict=True) for column in range(width)]
 
-# A05: up to here a log-scale is drawn; e^45 px across, nothing on the way to the pixels may overflow.
+# up to here a log-scale is drawn; e^45 px across, nothing on the way to the pixels may overflow.
 LARGEST_DRAWN = 44.0
 
 
-def picture(batch: Gaussians, camera: Camera) -> RenderResult:
+def render_view(batch: Gaussians, camera: Camera) -> RenderResult:
     return rasterize(batch, camera, torch.tensor(BACKGROUND, dtype=batch.means.dtype), threads=1)
 
 
@@ -54,7 +54,7 @@ def one(
     )
 
 
-# ---- A02: the sheared footprint
+# ---- the sheared footprint
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def exact_footprint(mean: Tensor, quat: Tensor, log_scales: Tensor, camera: Came
 
 
 def needles_of(length: float, count: int) -> tuple[Gaussians, Camera]:
-    """Needles `length` px long at most, 1e-6 as thick, turned at random, centred inside the picture."""
+    """Needles `length` px long at most, 1e-6 as thick, turned at random, centred inside the image."""
     camera = pinhole(focal=100.0)
     batch = gaussians(count, int(math.log10(length)), spread=0.15, depth=(2.0, 2.0), opacity=(0.5, 0.5))
     scales = torch.tensor([1.0, 1e-6, 1e-6], dtype=torch.float64) * length * 2.0 / camera.fx
@@ -103,7 +103,7 @@ def needles_of(length: float, count: int) -> tuple[Gaussians, Camera]:
 
 @pytest.mark.parametrize("length", [1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6])
 def test_the_footprint_of_a_needle_keeps_ten_digits(length: float) -> None:
-    """A02: determinant, slope and conditional variance of the oracle, and the exponent that the kernel draws."""
+    """determinant, slope and conditional variance of the oracle, and the exponent that the kernel draws."""
     batch, camera = needles_of(length, 60)
     offset = torch.zeros(len(batch), 2, dtype=torch.float64)
     prints = reference._project(batch.means, batch.quats, batch.log_scales, offset, camera, DEFAULT_SETTINGS)
@@ -127,11 +127,11 @@ def test_the_footprint_of_a_needle_keeps_ten_digits(length: float) -> None:
         within("exponent", error.max().item(), 1e-10)
 
 
-# ---- A04, A05: scales
+# ---- scales
 
 
-def test_gaussians_without_any_extent_are_blobs_of_the_blur() -> None:
-    """A04: all scales e^-80. Only the blur is left, and no gradient reaches a scale."""
+def test_gaussians_without_extent_have_the_footprint_of_the_low_pass_filter() -> None:
+    """All scales are e^-80: only the low-pass filter remains, and no gradient reaches a scale."""
     batch, camera = gaussians(1, 40, spread=0.1, opacity=(0.8, 0.8)), pinhole()
     batch = replace(batch, log_scales=torch.full_like(batch.log_scales, -80.0))
     ours = draw(rasterize, batch, camera, upstream(camera))
@@ -146,7 +146,7 @@ def test_gaussians_without_any_extent_are_blobs_of_the_blur() -> None:
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_the_flat_axis_of_a_disc_has_no_gradient(dtype: torch.dtype) -> None:
-    """A04: s = (1, 1, e^-80)."""
+    """The scales are (1, 1, e^-80)."""
     batch, camera = cast(gaussians(30, 41), dtype), pinhole()
     log_scales = torch.zeros_like(batch.log_scales)
     log_scales[:, 2] = -80.0
@@ -158,12 +158,12 @@ def test_the_flat_axis_of_a_disc_has_no_gradient(dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("log_scale", [-30.0, -10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 44.0, 60.0, 88.0, 89.0, math.inf])
-def test_a_scale_is_drawn_or_counted_and_never_spoils_the_picture(log_scale: float, dtype: torch.dtype) -> None:
-    """A05: isotropic and along one axis; drawn at least up to e^44, a scale that is not finite is counted."""
+def test_any_scale_is_drawn_or_culled_and_the_image_stays_finite(log_scale: float, dtype: torch.dtype) -> None:
+    """Isotropic and along one axis; drawn at least up to e^44, and culled if not finite."""
     camera = pinhole()
     for axes in (slice(0, 3), slice(1, 2)):
         batch = cast(gaussians(20, 42, log_scales=(-2.0, -1.0)), dtype)
-        # in the middle of the picture, so that the blob of a tiny one meets a pixel
+        # in the middle of the image, so that the blob of a tiny one meets a pixel
         means = batch.means.clone()
         means[7] = torch.tensor([0.01, 0.02, 2.5], dtype=dtype)
         log_scales = batch.log_scales.clone()
@@ -179,12 +179,12 @@ def test_a_scale_is_drawn_or_counted_and_never_spoils_the_picture(log_scale: flo
             assert drawing.result.culled["non_finite"] == 1
 
 
-# ---- A06: one poisoned number
+# ---- one poisoned number
 
 
 @pytest.mark.parametrize(("field", "column"), SLOTS, ids=[f"{field}{column}" for field, column in SLOTS])
-def test_a_poisoned_number_stays_with_its_gaussian(field: str, column: int) -> None:
-    """A06: whatever stands in one slot of one of 120, everything is finite; culled, it might as well not be there."""
+def test_an_extreme_or_non_finite_number_affects_only_its_gaussian(field: str, column: int) -> None:
+    """For any value of one number of one of 120 Gaussians, all results are finite; if culled, it has no effect."""
     info = torch.finfo(torch.float32)
     values = (math.nan, -math.nan, math.inf, -math.inf, 0.0, -0.0, info.tiny, 1e-40, info.eps, 1e20, -1e20, 1e38, -1e38)
     batch, camera = cast(gaussians(120, 43), torch.float32), pinhole()
@@ -209,12 +209,12 @@ def test_a_poisoned_number_stays_with_its_gaussian(field: str, column: int) -> N
             assert all(gradient.isfinite().all() for gradient in drawing.gradients.values()), value
 
 
-# ---- A08, A09: thresholds
+# ---- thresholds
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_opacities_around_the_thresholds_are_culled_kept_and_capped(dtype: torch.dtype) -> None:
-    """A08: a Gaussian whose centre is the centre of a pixel."""
+    """A Gaussian whose centre is the centre of a pixel."""
     scalar = np.float32 if dtype == torch.float32 else np.float64
     least = scalar(ALPHA_MIN)
     below, above = np.nextafter(least, scalar(0)), np.nextafter(least, scalar(1))
@@ -234,8 +234,8 @@ def test_opacities_around_the_thresholds_are_culled_kept_and_capped(dtype: torch
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_the_near_plane_is_exact_and_nothing_behind_it_is_drawn(dtype: torch.dtype) -> None:
-    """A09: at the camera, one step before, on and behind the near plane, behind the camera, far to the side."""
+def test_nothing_at_or_behind_the_near_plane_is_drawn(dtype: torch.dtype) -> None:
+    """At the camera, one ulp before, on and behind the near plane, behind the camera, far to the side."""
     scalar = np.float32 if dtype == torch.float32 else np.float64
     on = scalar(NEAR)
     camera = pinhole()
@@ -253,12 +253,12 @@ def test_the_near_plane_is_exact_and_nothing_behind_it_is_drawn(dtype: torch.dty
         assert all(gradient.isfinite().all() for gradient in drawing.gradients.values())
 
 
-# ---- A12: deep stacks
+# ---- deep stacks
 
 
 @pytest.mark.parametrize(("copies", "opacity"), [(1000, 0.05), (5000, 0.004)])
-def test_the_weights_of_a_deep_stack_and_the_rest_of_the_light_add_up_to_one(copies: int, opacity: float) -> None:
-    """A12: white Gaussians before a white background, and how much light is left where nothing stops."""
+def test_weights_and_transmittance_of_a_deep_stack_add_up_to_one(copies: int, opacity: float) -> None:
+    """White Gaussians in front of a white background, with and without a stop."""
     batch = rows(one((0.0, 0.0, 2.0), log_scales=(1.0, 1.0, 1.0), opacity=opacity), torch.zeros(copies).long())
     batch = cast(replace(batch, colors=torch.ones(copies, 3).double(), uids=torch.arange(copies)), torch.float32)
     camera = pinhole(4, 4)
@@ -272,16 +272,16 @@ def test_the_weights_of_a_deep_stack_and_the_rest_of_the_light_add_up_to_one(cop
     assert (unstopped.alpha - white.alpha).max().item() <= 1e-4 + 2 * forward_bound(copies)
 
 
-# ---- A14, A15, A18: cameras and gradients
+# ---- cameras and gradients
 
 
 @pytest.mark.parametrize("width", [40, 1000])
 @pytest.mark.parametrize("centre", [-1, 0, 2])
 def test_very_wide_and_off_centre_cameras_stay_within_the_bounds(width: int, centre: int) -> None:
-    """A14: a focal length of 5 px, the principal point a whole picture to the side."""
+    """A focal length of 5 px, the principal point up to an image width outside."""
     camera = pinhole(width, 1, focal=5.0, cx=float(centre * width), cy=0.5)
     batch = gaussians(30, 44, log_scales=(-2.0, 0.0))
-    # spread over the picture, which the principal point has left
+    # spread over the image, which the principal point has left
     random = torch.Generator().manual_seed(centre + 7)
     columns = torch.rand(30, generator=random, dtype=torch.float64) * width
     means = batch.means.clone()
@@ -291,13 +291,13 @@ def test_very_wide_and_off_centre_cameras_stay_within_the_bounds(width: int, cen
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("share", [1.05, 1.29, 1.31, 3.0, 10.0])
-def test_the_gradient_beside_the_picture_is_that_of_the_clamped_projection(share: float, axis: int) -> None:
-    """A15: at `share` of half the field of view; 1.3 is where the ratio is clamped before the Jacobian."""
+def test_outside_the_image_the_gradient_is_that_of_the_clamped_projection(share: float, axis: int) -> None:
+    """At `share` of half the field of view; 1.3 is where the ratio is clamped before the Jacobian."""
     camera = pinhole(24, 16, focal=8.0)
     half = (camera.width, camera.height)[axis] / (2 * camera.fx)
     mean, scales = [0.1, 0.15, 1.1], [0.3, 0.1, 0.5]
     mean[axis] = share * half * mean[2]
-    scales[axis] = math.log(0.7 * mean[axis])  # long enough to reach into the picture, where differences are accurate
+    scales[axis] = math.log(0.7 * mean[axis])  # long enough to reach into the image, where differences are accurate
     batch = replace(one(tuple(mean), log_scales=tuple(scales)), quats=torch.tensor([[1.0, 0.05, -0.1, 0.08]]).double())
     cotangent = upstream(camera, 3)
     ours = draw(rasterize, batch, camera, cotangent, settings=SMOOTH).gradients
@@ -309,8 +309,7 @@ def test_the_gradient_beside_the_picture_is_that_of_the_clamped_projection(share
     assert_single_precision_holds((batch, camera))
 
 
-def test_each_of_the_fourteen_numbers_of_a_gaussian_has_the_gradient_of_central_differences() -> None:
-    """A18: number by number."""
+def test_all_fourteen_gradients_of_a_gaussian_equal_central_differences() -> None:
     camera = pinhole(24, 16, focal=20.0)
     batch = one((0.1, -0.07, 2.0), log_scales=(-1.0, -1.6, -0.6), opacity=0.6)
     cotangent = upstream(camera, 5)

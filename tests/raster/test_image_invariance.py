@@ -1,7 +1,6 @@
-"""Tiles, symmetries, memory and other things that pictures must not depend on: cases B of the test matrix.
+"""Images do not depend on tiles, threads, memory contents or order, and keep the symmetries of the scene.
 
-B01, B07, B10, B15 and B17 are tests of `test_agreement` and `test_invariants`. B02 moves the tiles, because the kernel
-has one size of them. B05 is left out: a count beyond 2^32 cannot be reached without the memory it is there to refuse.
+The limit of 2^32 pairs is not tested: reaching it needs more memory than test machines have.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from tests.raster.comparison import BACKGROUND, Drawing, decisions, draw, relative, upstream
 from tests.raster.evidence import within
-from tests.raster.matrix import FLIP, PeakMemory, forward_bound
+from tests.raster.extremes import FLIP, PeakMemory, forward_bound
 from tests.scenes import FLOATS, SCENES, Scene, cast, deep_stack, gaussians, overlapping, pinhole, rows
 
 IMAGES = ("color", "alpha", "depth")
 DTYPES = [torch.float32, torch.float64]
 
 
-def picture(batch: Gaussians, camera: Camera, settings: RasterSettings = DEFAULT_SETTINGS) -> RenderResult:
+def render_view(batch: Gaussians, camera: Camera, settings: RasterSettings = DEFAULT_SETTINGS) -> RenderResult:
     return rasterize(batch, camera, torch.tensor(BACKGROUND, dtype=batch.means.dtype), settings=settings, threads=1)
 
 
@@ -57,13 +56,13 @@ def product(left: Tensor, right: Tensor) -> Tensor:
     )
 
 
-# ---- B02, B03, B18: tiles
+# ---- tiles
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_where_the_tiles_lie_leaves_no_trace(seed: int) -> None:
-    """B02: the same window of a larger picture, its first pixel in every phase of a tile."""
-    settings = replace(DEFAULT_SETTINGS, frustum_margin=1e6)  # the clamp depends on where the picture ends
+def test_the_position_of_tiles_does_not_matter(seed: int) -> None:
+    """The same window of a larger image, at every offset relative to the tiles."""
+    settings = replace(DEFAULT_SETTINGS, frustum_margin=1e6)  # the clamp depends on where the image ends
     batch = gaussians(60, seed, log_scales=(-4.0, -0.5))
     small = pinhole(21, 19)
     expected = draw(rasterize, batch, small, upstream(small), settings=settings)
@@ -82,10 +81,10 @@ def test_where_the_tiles_lie_leaves_no_trace(seed: int) -> None:
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("direction", [(1, 0), (-1, 0), (0, 1), (0, -1)])
-def test_a_footprint_that_ends_on_the_edge_of_a_tile_is_decided_alike_everywhere(
+def test_a_footprint_that_ends_at_the_edge_of_a_tile_is_treated_alike_everywhere(
     direction: tuple[int, int], dtype: torch.dtype
 ) -> None:
-    """B03: variance 1, o = e^4.5 / 255 give alpha = 1/255 three pixels from the centre, to rounding.
+    """Variance 1, o = e^4.5 / 255 give alpha = 1/255 three pixels from the centre, to rounding.
 
     The centre takes every place in a tile, so that this pixel lies in the same tile or the next. Distances are rounded
     relative to a block, so a few units in the last place may decide either way, but forward and backward alike; 64 of
@@ -123,7 +122,7 @@ def test_a_footprint_that_ends_on_the_edge_of_a_tile_is_decided_alike_everywhere
 
 
 def test_a_gaussian_crosses_the_edge_of_a_tile_without_a_jump() -> None:
-    """B18: in steps of a thousandth of a pixel. o G has slope 0.607 / sqrt(0.3) = 1.11 at most; 1/255 is the cut."""
+    """In steps of a thousandth of a pixel. o G has slope 0.607 / sqrt(0.3) = 1.11 at most; 1/255 is the cut."""
     batch = replace(
         gaussians(1, 60, spread=0.0, opacity=(1.0, 1.0)), log_scales=torch.full((1, 3), -9.0, dtype=torch.float64)
     )
@@ -141,7 +140,7 @@ def test_a_gaussian_crosses_the_edge_of_a_tile_without_a_jump() -> None:
             before = alpha
 
 
-# ---- B04, B06: size
+# ---- size
 
 
 def memory_model(pairs: int, gaussian_count: int, pixels: int, deepest: int, threads: int) -> int:
@@ -158,8 +157,8 @@ def frame_of(result: RenderResult) -> object:
     return result.color.grad_fn.frame  # type: ignore[union-attr]
 
 
-def test_two_thousand_gaussians_over_the_whole_picture_fit_the_memory_they_are_meant_to_take() -> None:
-    """B04: 2.4 million pairs of tile and Gaussian at 640 x 480."""
+def test_two_thousand_gaussians_over_the_whole_image_fit_into_the_predicted_memory() -> None:
+    """2.4 million pairs of tile and Gaussian at 640 x 480."""
     count, camera = 2000, pinhole(640, 480, focal=500.0)
     batch = cast(gaussians(count, 61, spread=0.3, log_scales=(1.5, 2.0), opacity=(0.3, 0.6)), torch.float32)
     leaves = {name: getattr(batch, name).requires_grad_() for name in FLOATS}
@@ -176,7 +175,7 @@ def test_two_thousand_gaussians_over_the_whole_picture_fit_the_memory_they_are_m
 
 @pytest.mark.slow
 def test_twelve_megapixels_with_gaussians_over_all_of_them_keep_their_gradient() -> None:
-    """B06: 1e5 small Gaussians and 200 that fill 4000 x 3000 pixels, forward, SSIM and backward."""
+    """1e5 small Gaussians and 200 that fill 4000 x 3000 pixels, forward, SSIM and backward."""
     camera = pinhole(4000, 3000, focal=3000.0)
     small = gaussians(100_000, 62, log_scales=(-7.0, -5.5), opacity=(0.1, 0.9))
     large = gaussians(200, 63, spread=0.2, log_scales=(0.0, 0.7), opacity=(0.005, 0.03))
@@ -202,12 +201,12 @@ def test_twelve_megapixels_with_gaussians_over_all_of_them_keep_their_gradient()
         within(f"gradient of {name}", relative(gradient, double[name]), 1e-5)
 
 
-# ---- B08, B09: sums of light
+# ---- sums of light
 
 
 @pytest.mark.parametrize("build", [overlapping, deep_stack])
-def test_where_everything_has_one_colour_opacity_has_no_gradient(build: Callable[[], Scene]) -> None:
-    """B08: T (q - Q) is 0 for every contributor, to 4 units of roundoff of q; so is the sum over pixels."""
+def test_opacity_has_no_gradient_if_everything_has_one_colour(build: Callable[[], Scene]) -> None:
+    """T (q - Q) is 0 for every contributor, to 4 units of roundoff of q; so is the sum over pixels."""
     batch, camera = build()
     batch = cast(replace(batch, colors=torch.full_like(batch.colors, 0.5)), torch.float32)
     leaves = {name: getattr(batch, name).clone().requires_grad_() for name in ("opacities", "colors")}
@@ -225,14 +224,14 @@ def test_where_everything_has_one_colour_opacity_has_no_gradient(build: Callable
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_every_pixel_is_a_mixture_of_what_it_sees(name: str) -> None:
-    """B09: weights and the rest of the light add up to 1, alpha and colours stay in their range."""
+def test_every_pixel_is_a_convex_combination(name: str) -> None:
+    """Weights and transmittance add up to 1, and alpha and colours stay in their range."""
     batch, camera = SCENES[name]()
     batch = cast(batch, torch.float32)
     bound = forward_bound(decisions(cast(batch, torch.float64), camera).deepest)
     white = rasterize(replace(batch, colors=torch.ones_like(batch.colors)), camera, torch.ones(3), threads=1)
     within("sum of weights and transmittance less 1", (white.color - 1).abs().max().item(), bound)
-    ours = picture(batch, camera)
+    ours = render_view(batch, camera)
     assert ours.alpha.min() >= 0
     assert ours.alpha.max() <= 1
     assert ours.color.min() >= 0
@@ -241,19 +240,19 @@ def test_every_pixel_is_a_mixture_of_what_it_sees(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["overlapping", "deep_stack", "opaque"])
-def test_light_only_gets_less_as_gaussians_are_added_behind(name: str) -> None:
-    """B09: the transmittance never rises, not by a bit."""
+def test_transmittance_never_rises_as_gaussians_are_added_behind(name: str) -> None:
+    """To the last bit."""
     batch, camera = SCENES[name]()
     batch = cast(batch, torch.float32)
     batch = rows(batch, batch.means[:, 2].argsort())
     before = torch.ones(camera.height, camera.width)
     for count in range(0, len(batch) + 1, max(1, len(batch) // 60)):
-        left = 1 - picture(rows(batch, torch.arange(count)), camera).alpha
+        left = 1 - render_view(rows(batch, torch.arange(count)), camera).alpha
         assert (left <= before).all()
         before = left
 
 
-# ---- B11, B12, B13: symmetries
+# ---- symmetries
 
 
 def quantised(scene: Scene) -> Scene:
@@ -301,12 +300,12 @@ def quaternion_of(turn: np.ndarray) -> Tensor:
     raise AssertionError("every rotation of the cube has one")
 
 
-def test_scene_and_camera_moved_together_give_the_same_picture() -> None:
-    """B11: 24 rotations of the cube, each with a dyadic translation."""
+def test_moving_scene_and_camera_together_gives_the_same_image() -> None:
+    """24 rotations of the cube, each with a dyadic translation."""
     batch, camera = quantised(overlapping())
     batch = cast(batch, torch.float32)
     steady = decisions(cast(batch, torch.float64), camera).steady
-    expected = picture(batch, camera)
+    expected = render_view(batch, camera)
     turns = list(cube_rotations())
     assert len(turns) == 24
     for index, turn in enumerate(turns):
@@ -320,13 +319,13 @@ def test_scene_and_camera_moved_together_give_the_same_picture() -> None:
         pose[:3, :3] = turn.T
         pose[:3, 3] = -turn.T @ shift
         there = Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-        assert_images_agree(picture(moved, there), expected, steady, 4e-6)
+        assert_images_agree(render_view(moved, there), expected, steady, 4e-6)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("exponent", [-13, -3, 3, 10, 17])
 def test_lengths_times_a_power_of_two_give_the_same_bits(exponent: int, dtype: torch.dtype) -> None:
-    """B12: positions and near plane, with scales that the blur outweighs: rho + k ln 2 is not exact, so see below."""
+    """Positions and near plane, with scales that the blur outweighs: rho + k ln 2 is not exact, so see below."""
     factor = 2.0**exponent
     batch, camera = gaussians(60, 64), pinhole()
     batch = cast(replace(batch, log_scales=torch.full_like(batch.log_scales, -60.0)), dtype)
@@ -351,13 +350,13 @@ def test_lengths_times_a_power_of_two_give_the_same_bits(exponent: int, dtype: t
 
 
 @pytest.mark.parametrize("exponent", [-13, -3, 3, 10, 17])
-def test_scales_that_follow_their_lengths_give_the_same_picture(exponent: int) -> None:
-    """B12: rho + k ln 2 rounds to 2^-52 of itself, which twelve digits of a picture in double do not see."""
+def test_scaling_positions_and_scales_together_gives_the_same_image(exponent: int) -> None:
+    """rho + k ln 2 has a relative rounding error of 2^-52, which does not show in twelve digits of the image."""
     factor = 2.0**exponent
     batch, camera = overlapping()
     scaled = replace(batch, means=batch.means * factor, log_scales=batch.log_scales + exponent * math.log(2))
     settings = replace(DEFAULT_SETTINGS, near=DEFAULT_SETTINGS.near * factor)
-    first, second = picture(batch, camera), picture(scaled, camera, settings)
+    first, second = render_view(batch, camera), render_view(scaled, camera, settings)
     torch.testing.assert_close(second.color, first.color, rtol=0, atol=1e-12)
     torch.testing.assert_close(second.alpha, first.alpha, rtol=0, atol=1e-12)
     torch.testing.assert_close(second.depth / factor, first.depth, rtol=0, atol=1e-11)
@@ -365,8 +364,8 @@ def test_scales_that_follow_their_lengths_give_the_same_picture(exponent: int) -
 
 
 @pytest.mark.parametrize("name", ["overlapping", "needles", "off_centre", "wide"])
-def test_a_mirrored_scene_gives_the_mirrored_picture(name: str) -> None:
-    """B13: x -> -x and cx -> W - cx; a rotation keeps w and x of its quaternion and turns the other two around."""
+def test_a_mirrored_scene_gives_the_mirrored_image(name: str) -> None:
+    """x -> -x and cx -> W - cx; the quaternion of a rotation keeps w and x and negates y and z."""
     batch, camera = SCENES[name]()
     batch = cast(batch, torch.float32)
     choice = decisions(cast(batch, torch.float64), camera)
@@ -376,12 +375,12 @@ def test_a_mirrored_scene_gives_the_mirrored_picture(name: str) -> None:
         quats=batch.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]),
     )
     there = Camera(np.eye(4), camera.fx, camera.fy, camera.width - camera.cx, camera.cy, camera.width, camera.height)
-    flipped = picture(mirrored, there)
+    flipped = render_view(mirrored, there)
     flipped = replace(flipped, **{field: getattr(flipped, field).flip(1) for field in IMAGES})
-    assert_images_agree(flipped, picture(batch, camera), choice.steady, forward_bound(choice.deepest))
+    assert_images_agree(flipped, render_view(batch, camera), choice.steady, forward_bound(choice.deepest))
 
 
-# ---- B14: threads and memory
+# ---- threads and memory
 
 
 @pytest.fixture(params=DTYPES, ids=["single", "double"])
@@ -391,10 +390,10 @@ def clean_drawing(request: pytest.FixtureRequest) -> tuple[Gaussians, Camera, Dr
     return batch, camera, draw(rasterize, batch, camera, upstream(camera), threads=1)
 
 
-def test_what_memory_held_before_does_not_show(
+def test_previous_memory_contents_do_not_matter(
     clean_drawing: tuple[Gaussians, Camera, Drawing], dirty_memory: None
 ) -> None:
-    """B14: twenty times, with 1, 2, 4 and 8 threads in turn."""
+    """Twenty times, with 1, 2, 4 and 8 threads in turn."""
     batch, camera, clean = clean_drawing
     assert torch.empty(1 << 16).isnan().all(), "the memory is not dirty"
     cotangent = upstream(camera)
@@ -402,8 +401,8 @@ def test_what_memory_held_before_does_not_show(
         assert_same_bits(clean, draw(rasterize, batch, camera, cotangent, threads=threads))
 
 
-def test_what_memory_held_before_does_not_show_where_nothing_is_drawn(dirty_memory: None) -> None:
-    """B14: early exits leave no holes, forward or backward."""
+def test_previous_memory_contents_do_not_matter_where_nothing_is_drawn(dirty_memory: None) -> None:
+    """Early exits write all outputs, forward and backward."""
     camera = pinhole(35, 18)
     visible = gaussians(5, 66, spread=0.02, log_scales=(-5.0, -4.0))  # the middle tiles only
     for batch in (visible, replace(visible, means=-visible.means), gaussians(0, 66)):
@@ -416,7 +415,7 @@ def test_what_memory_held_before_does_not_show_where_nothing_is_drawn(dirty_memo
 
 
 def test_many_gaussians_are_sorted_alike_by_any_number_of_threads() -> None:
-    """B14, B10: enough of them that threads share the sort, at 97 depths, so that uids decide among hundreds."""
+    """40 000 Gaussians at 97 depths: threads share the sort, and uids decide among hundreds of equal depths."""
     count, camera = 40_000, pinhole()
     batch = cast(gaussians(count, 69, log_scales=(-6.0, -4.0), opacity=(0.05, 0.5)), torch.float32)
     means = batch.means.clone()
@@ -433,11 +432,11 @@ def test_many_gaussians_are_sorted_alike_by_any_number_of_threads() -> None:
             assert torch.equal(other.gradients[name], one.gradients[name][shuffle]), name
 
 
-# ---- B16: order
+# ---- order
 
 
-def test_two_that_swap_places_change_a_pixel_by_what_both_hide() -> None:
-    """B16: equal depth, the camera turned by a billionth either way: the jump is T a_i a_j |c_i - c_j|."""
+def test_swapping_two_gaussians_in_depth_changes_a_pixel_by_their_overlap() -> None:
+    """Equal depth, the camera turned by a billionth either way: the jump is T a_i a_j |c_i - c_j|."""
     batch = gaussians(2, 67, spread=0.0, log_scales=(-1.5, -1.0), opacity=(0.7, 0.7))
     means = torch.tensor([[-0.1, 0.0, 3.0], [0.1, 0.0, 3.0]], dtype=torch.float64)
     batch = replace(batch, means=means, colors=torch.tensor([[0.9, 0.1, 0.4], [0.2, 0.8, 0.3]], dtype=torch.float64))
@@ -454,9 +453,9 @@ def test_two_that_swap_places_change_a_pixel_by_what_both_hide() -> None:
         pose[0, 2], pose[2, 0] = math.sin(angle), -math.sin(angle)
         return Camera(pose, base.fx, base.fy, base.cx, base.cy, base.width, base.height)
 
-    first, second = (picture(both, turned(angle)).color for angle in (1e-9, -1e-9))
+    first, second = (render_view(both, turned(angle)).color for angle in (1e-9, -1e-9))
     jump = (first - second).norm(dim=2)
-    alphas = [picture(rows(both, torch.tensor([i])), base).alpha for i in range(3)]
+    alphas = [render_view(rows(both, torch.tensor([i])), base).alpha for i in range(3)]
     difference = (batch.colors[0] - batch.colors[1]).norm()
     expected = (1 - alphas[0]) * alphas[1] * alphas[2] * difference
     assert expected.max().item() > 0.1
