@@ -1,4 +1,4 @@
-"""Hand-made metrics of runs that nobody trained, and the words of a drawing."""
+"""Hand-made metrics of runs, and the texts of a drawing."""
 
 from __future__ import annotations
 
