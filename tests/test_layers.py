@@ -56,7 +56,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         ),
         *("graings.raster", "graings.render", "graings.report", "graings.scene", "graings.storage"),
     ),
-    "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.training"),
+    "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.config", "graings.evaluation", "graings.kernel"),
         *("graings.render", "graings.report", "graings.storage", "graings.training"),

@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from graings.constants import MAX_IMAGE_SIDE
+
 
 class ConfigSection(BaseModel):
     """Strict base class: unknown fields and non-finite numbers are refused; values are frozen."""
@@ -27,7 +29,7 @@ class CaptureConfig(ConfigSection):
     max_side: int | None = Field(
         400,
         ge=16,
-        le=16384,
+        le=MAX_IMAGE_SIDE,
         description="Longest image side in px; larger images are scaled down. null: keep the size of the files.",
     )
     background: Literal["auto", "white", "black"] | tuple[Channel, Channel, Channel] = Field(

@@ -6,13 +6,15 @@ event wherever it is written. Programs decide by `kind`.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, computed_field, model_validator
 
 from graings.document import Document
 
 Channel = Annotated[float, Field(ge=0, le=1)]
+
+KIND: Final = "Kind of the event."
 
 
 class _Event(Document):
@@ -43,7 +45,7 @@ class _Event(Document):
 class BackgroundFound(_Event):
     """The colour of the background is not white."""
 
-    kind: Literal["background"] = "background"
+    kind: Literal["background"] = Field("background", description=KIND)
     color: tuple[Channel, Channel, Channel] = Field(description="RGB in [0, 1].")
 
     def _words(self) -> str:
@@ -54,7 +56,7 @@ class BackgroundFound(_Event):
 class PointsInitialized(_Event):
     """Where the first anchors come from, in a capture without point cloud whose masks cover the whole image."""
 
-    kind: Literal["initial_points"] = "initial_points"
+    kind: Literal["initial_points"] = Field("initial_points", description=KIND)
     source: Literal["random", "triangulation"] = Field(
         description="random: uniform in a cube. triangulation: matched between pairs of images."
     )
@@ -78,7 +80,7 @@ class PointsInitialized(_Event):
 class TimeWindowStarted(_Event):
     """Training begins with a part of the clip."""
 
-    kind: Literal["time_window"] = "time_window"
+    kind: Literal["time_window"] = Field("time_window", description=KIND)
     share: float = Field(gt=0, lt=1, description="Share of the clip, around its middle, that the first steps use.")
 
     def _words(self) -> str:
@@ -88,7 +90,7 @@ class TimeWindowStarted(_Event):
 class LowResolutionStarted(_Event):
     """Training begins with downscaled images."""
 
-    kind: Literal["low_resolution"] = "low_resolution"
+    kind: Literal["low_resolution"] = Field("low_resolution", description=KIND)
     factor: int = Field(gt=1, description="How many times smaller along each side the first images are.")
 
     def _words(self) -> str:
@@ -98,7 +100,7 @@ class LowResolutionStarted(_Event):
 class Grew(_Event):
     """Anchors were added."""
 
-    kind: Literal["grew"] = "grew"
+    kind: Literal["grew"] = Field("grew", description=KIND)
     anchors: int = Field(gt=0, description="How many anchors were added.")
 
     def _words(self) -> str:
@@ -108,7 +110,7 @@ class Grew(_Event):
 class GrowthCapped(_Event):
     """More anchors qualified for growth than could be added."""
 
-    kind: Literal["growth_capped"] = "growth_capped"
+    kind: Literal["growth_capped"] = Field("growth_capped", description=KIND)
     anchors: int = Field(ge=0, description="Anchors of the scene after this growth.")
     max_anchors: int = Field(gt=0, description="Anchors that the scene may have.")
 
@@ -122,7 +124,7 @@ class GrowthCapped(_Event):
 class Pruned(_Event):
     """Anchors that show nothing were removed."""
 
-    kind: Literal["pruned"] = "pruned"
+    kind: Literal["pruned"] = Field("pruned", description=KIND)
     anchors: int = Field(gt=0, description="How many anchors were removed.")
 
     def _words(self) -> str:
@@ -132,7 +134,7 @@ class Pruned(_Event):
 class Thinned(_Event):
     """More anchors were there from the start than the budget allows: a random part of them was removed."""
 
-    kind: Literal["thinned"] = "thinned"
+    kind: Literal["thinned"] = Field("thinned", description=KIND)
     anchors_before: int = Field(gt=0, description="Anchors before.")
     anchors_after: int = Field(gt=0, description="Anchors after.")
 
@@ -145,7 +147,7 @@ class Thinned(_Event):
 class GradientsClipped(_Event):
     """The gradients of one group of parameters were far above their usual norm and were scaled down."""
 
-    kind: Literal["clipped"] = "clipped"
+    kind: Literal["clipped"] = Field("clipped", description=KIND)
     group: str = Field(description="Parameter group; screen: gradients of the projected centres.")
     norm: float = Field(gt=0, description="Euclidean norm of the group's gradients.")
     limit: float = Field(gt=0, description="Norm they were scaled down to.")
@@ -159,7 +161,7 @@ class GradientsClipped(_Event):
 class StepSkipped(_Event):
     """The loss or a gradient was not finite; the parameters were left as they were."""
 
-    kind: Literal["skipped"] = "skipped"
+    kind: Literal["skipped"] = Field("skipped", description=KIND)
     non_finite: str = Field(description="What was not finite: the loss, or the gradient of a parameter.")
     views: tuple[str, ...] = Field(description="Views of the step.")
     times: tuple[float, ...] = Field(description="Normalised times of these views.")
@@ -172,7 +174,7 @@ class StepSkipped(_Event):
 class RolledBack(_Event):
     """Training went wrong and continues from an earlier state, with lower learning rates and another order of views."""
 
-    kind: Literal["rolled_back"] = "rolled_back"
+    kind: Literal["rolled_back"] = Field("rolled_back", description=KIND)
     to_iteration: int = Field(ge=0, description="Iteration of the run whose state was restored.")
     reason: str = Field(description="What went wrong, in plain words.")
     rate_factor: float = Field(gt=0, le=1, description="Factor on all learning rates from here on.")
@@ -187,7 +189,7 @@ class RolledBack(_Event):
 class OpacityReset(_Event):
     """In a whole pass over the views nothing was drawn: opacities were raised."""
 
-    kind: Literal["opacity_reset"] = "opacity_reset"
+    kind: Literal["opacity_reset"] = Field("opacity_reset", description=KIND)
     opacity: float = Field(gt=0, lt=1, description="Opacity that the median Gaussian got.")
     shift: float = Field(description="What was added to all opacity logits.")
 
@@ -201,7 +203,7 @@ class OpacityReset(_Event):
 class Restarted(_Event):
     """A large moving object was missing in many views: training starts again on a part of the clip."""
 
-    kind: Literal["restart"] = "restart"
+    kind: Literal["restart"] = Field("restart", description=KIND)
     missing_share: float = Field(ge=0, le=1, description="Share of the checked training views in which it was missing.")
     time_window: float = Field(gt=0, lt=1, description="Share of the clip that the new start begins with.")
 
@@ -215,7 +217,7 @@ class Restarted(_Event):
 class Stiff(_Event):
     """The last optimiser steps were longer than the Gaussians they moved."""
 
-    kind: Literal["stiff"] = "stiff"
+    kind: Literal["stiff"] = Field("stiff", description=KIND)
     step_over_size: float = Field(
         gt=1, description="Length of a step over the size of the Gaussian it moved, 99th percentile."
     )
@@ -230,7 +232,7 @@ class Stiff(_Event):
 class Diverged(_Event):
     """Training went wrong once more than it may roll back, and ended."""
 
-    kind: Literal["diverged"] = "diverged"
+    kind: Literal["diverged"] = Field("diverged", description=KIND)
     reason: str = Field(description="What went wrong, in plain words.")
 
     def _words(self) -> str:

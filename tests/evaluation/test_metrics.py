@@ -142,7 +142,7 @@ def test_absent_perceptual_weights_are_named_and_never_fetched(tmp_path: Path, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_damaged_perceptual_weights_are_told_from_absent_ones(tmp_path: Path) -> None:
+def test_damaged_perceptual_weights_are_distinguished_from_absent_ones(tmp_path: Path) -> None:
     file = tmp_path / VGG_FILE
     assert "not installed" in str(_backbone_problem(file))
     file.write_bytes(b"half a download")

@@ -88,7 +88,7 @@ def test_events_come_back_with_their_message(tmp_path: Path) -> None:
     assert last_progress(path) == report(5, events=(Grew(iteration=5, anchors=1_200),))
 
 
-def test_a_reader_who_wants_the_newest_line_starts_at_it(tmp_path: Path) -> None:
+def test_a_reader_can_start_at_the_newest_report(tmp_path: Path) -> None:
     path = tmp_path / "progress.jsonl"
     assert last_start(path) == 0
     for count in (1, 2, 2_000):

@@ -32,7 +32,7 @@ def read(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with a model that nobody trained."""
+    """A run with an untrained model."""
     folder = write_run(tmp_path_factory.mktemp("runs") / "tiny", metrics(*CURVE))
     eyes = ((0.0, -2.0, 0.5), (2.0, 0.0, 0.3))
     cameras = [Camera.look_at(eye, (0, 0, 0), fov=0.8, width=40, height=30) for eye in eyes]
@@ -57,7 +57,7 @@ def model(run: Path) -> Model:
     return load_model(run)
 
 
-def test_every_setting_is_measured_against_the_picture_without_cut_offs(model: Model) -> None:
+def test_every_setting_is_measured_against_the_rendering_without_cut_offs(model: Model) -> None:
     part = render_part("tiny", model)
     points = part.points
     assert [p.setting for p in points] == list(settings())

@@ -73,7 +73,7 @@ def test_what_the_first_evaluation_had_already_is_not_extrapolated() -> None:
     assert "first evaluation" in found.reason
 
 
-def test_without_an_evaluation_every_target_says_so() -> None:
+def test_without_an_evaluation_every_target_has_that_reason() -> None:
     assert [entry.reason for entry in time_to_psnr([], [25.0, 30.0])] == ["no held-out view was evaluated"] * 2
 
 
@@ -96,7 +96,7 @@ def test_a_training_time_with_evaluation_in_it_is_flagged() -> None:
     assert "train_s is 92 s" in phase_times(metrics(train_s=92.0)).problems[0]
 
 
-def test_the_clock_on_the_wall_sees_what_nobody_booked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_wall_clock_includes_time_of_no_phase(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.perf_counter", lambda: 53.0)
     clock = Clock({"joint": 4.0}, 5.0, _started=50.0)
     clock.add("evaluation", 2.0)
