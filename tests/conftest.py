@@ -17,6 +17,12 @@ from tests import shapes
 install_import_hook(["graings.scene", "graings.training", "graings.render"], f"{shapes.__name__}.checked")
 
 
+def pytest_runtest_setup() -> None:
+    """Every test begins with all shape checks and one thread: two processes run tests beside each other."""
+    shapes.begin_test()
+    kernel.use_threads(1)
+
+
 @pytest.fixture(params=kernel.available_isas())
 def isa(request: pytest.FixtureRequest) -> Iterator[str]:
     """Every instruction set this CPU can run, one after the other."""

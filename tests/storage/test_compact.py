@@ -119,7 +119,9 @@ def test_a_folder_where_a_file_is_wanted_is_named(run: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"no gzip", gzip.compress(b"no tensors"), gzip.compress(b"\x02" + bytes(7) + b"{}")]
+    "content",
+    [b"", b"no gzip", gzip.compress(b"no tensors"), gzip.compress(b"\x02" + bytes(7) + b"{}")],
+    ids=["empty", "no gzip", "no tensors", "no header"],
 )
 def test_a_file_that_is_no_model_is_named(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "scene.graings"
