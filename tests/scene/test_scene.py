@@ -140,7 +140,7 @@ GEOMETRY, APPEARANCE = ("means", "quats", "log_scales"), ("opacities", "colors")
         ({"residual": False}, {"static", "deformation"}, APPEARANCE),
         ({"deformation": "none"}, {"static", "residual"}, GEOMETRY),
     ],
-    ids=str,
+    ids=("full", "single_mlp", "no_canonical", "no_residual", "no_deformation"),
 )
 def test_a_structural_ablation_removes_its_networks_and_all_others_are_trained(
     ablation: dict[str, object], networks: set[str], constant: tuple[str, ...]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from graings.config import GuardConfig
-from graings.training.guard.guard import FEWEST, MAX_RECENT_SKIPS, MEMORY, WINDOW, Gradient, Guard, first_not_finite
+from graings.training.guard.guard import MIN_NORMS, MAX_RECENT_SKIPS, MEMORY, WINDOW, Gradient, Guard, first_not_finite
 from graings.training.guard.loss_trend import GROWTH_PAUSE, LossTrend
 
 ONE, NAN = torch.tensor(1.0), torch.tensor(float("nan"))
@@ -52,7 +52,7 @@ def test_a_group_far_above_its_median_norm_is_clipped_and_the_others_are_not() -
 
 def test_nothing_is_clipped_before_the_usual_norm_is_known() -> None:
     guard = Guard(GuardConfig())
-    for iteration in range(FEWEST):
+    for iteration in range(MIN_NORMS):
         assert not guard.check_step(iteration, ONE, _gradient(torch.tensor([10.0**iteration]))).limits
 
 

@@ -9,7 +9,7 @@ import torch
 
 from graings.config import TrainConfig
 from graings.training.optimizer import Optimizer
-from graings.training.trainer import phases
+from graings.config.schedule import phases
 from tests.models import EYE, tiny_scene
 
 
