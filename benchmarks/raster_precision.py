@@ -47,7 +47,7 @@ TICKS = (0.1, 0.2, 0.5, 1, 1.5, 2, 3, 5, 10, 20, 50, 100)
 
 @dataclass(frozen=True)
 class Point:
-    """One way to draw the picture: what it costs and how wrong it is."""
+    """One way to render: its cost and its error."""
 
     group: str
     label: str
@@ -84,7 +84,7 @@ def scaled(camera: Camera, factor: float) -> Camera:
 
 
 class Bench:
-    """One scene and camera, with the picture everything is compared with."""
+    """One scene and camera, with the reference image."""
 
     def __init__(self, generator: Any, count: int, size: int, rounds: int) -> None:
         raw, view = generator.make_scene(count), generator.camera(size)
@@ -102,7 +102,7 @@ class Bench:
         self, group: str, label: str, *, settings: RasterSettings = DEFAULT, dtype: torch.dtype = torch.float32,
         factor: float = 1.0, threads: int | None = None,
     ) -> Point:  # fmt: skip
-        """Time and error of one setting; pictures of another resolution are scaled back bilinearly."""
+        """Time and error of one setting; images of another resolution are scaled back bilinearly."""
         use_threads(threads)
         gaussians, camera = cast(self.gaussians, dtype), scaled(self.camera, factor)
         background = torch.zeros(3, dtype=dtype)

@@ -1,4 +1,4 @@
-"""A model as one small file: smaller, the same pictures, and a clear word where it is none."""
+"""The compact file of a model: smaller, the same images, and a clear error where a file is none."""
 
 from __future__ import annotations
 
@@ -108,8 +108,8 @@ def test_a_model_of_which_nothing_shows_is_an_empty_picture(run: Path, tmp_path:
     write_compact(model, tmp_path / "scene.graings")
     small, view = read_compact(tmp_path / "scene.graings"), model.views["val"][0]
     assert small.scene.scaffold.count == 0
-    picture = render(small.scene, view.camera, view.time, small.background).color
-    assert torch.equal(picture, torch.tensor(small.background).expand_as(picture))
+    image = render(small.scene, view.camera, view.time, small.background).color
+    assert torch.equal(image, torch.tensor(small.background).expand_as(image))
 
 
 def test_a_folder_where_a_file_is_wanted_is_named(run: Path, tmp_path: Path) -> None:
