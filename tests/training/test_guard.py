@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from graings.config import GuardConfig
-from graings.training.guard.guard import MIN_NORMS, MAX_RECENT_SKIPS, MEMORY, WINDOW, Gradient, Guard, first_not_finite
+from graings.training.guard.guard import MAX_RECENT_SKIPS, MEMORY, MIN_NORMS, WINDOW, Gradient, Guard, first_not_finite
 from graings.training.guard.loss_trend import GROWTH_PAUSE, LossTrend
 
 ONE, NAN = torch.tensor(1.0), torch.tensor(float("nan"))

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from graings.config import TrainConfig
-from graings.training.optimizer import Optimizer
 from graings.config.schedule import phases
+from graings.training.optimizer import Optimizer
 from tests.models import EYE, tiny_scene
 
 
