@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from graings.config import make_config
+from graings.config import PRESETS, TrainConfig, make_config
 from graings.config.overrides import MAX_DEPTH
 from graings.errors import ConfigError
 
@@ -63,3 +63,13 @@ def test_every_option_is_less_deep_than_the_limit() -> None:
 def test_a_single_value_is_not_a_section(overrides: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make_config("draft", overrides)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_has_its_values_however_the_configuration_is_made(name: str) -> None:
+    """The name of a preset never stands over the values of another one."""
+    made = make_config(name)
+    assert TrainConfig.model_validate({"preset": name}) == made
+    assert TrainConfig.model_validate(made.model_dump(mode="json")) == made
+    changed = TrainConfig.model_validate({"preset": name, "scene": {"children": 3}, "iterations": 7})
+    assert changed == make_config(name, {"scene.children": 3, "iterations": 7})
