@@ -83,6 +83,7 @@ def test_trouble_with_the_report_is_logged_and_ends_nothing(
     assert "no report: RuntimeError: no ink" in capsys.readouterr().err
 
 
+@pytest.mark.slow(reason="a process that goes back three times; test_diverged has the same without a process")
 def test_a_training_that_comes_apart_ends_diverged_with_a_model_and_a_last_report(tmp_path: Path) -> None:
     store = Store(tmp_path)
     # A rate that grows out of all bounds: the first steps are sound, a few dozen later the numbers run out.

@@ -96,7 +96,7 @@ def test_a_job_outlives_kill_9_of_its_worker_and_leaving_brings_it_back_in_the_q
     assert list(jobs.store.workers.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="seven processes that train")
 def test_jobs_are_cancelled_resumed_retried_and_finished(jobs: JobQueue) -> None:
     endless, brief = submit(jobs, ENDLESS, "a"), submit(jobs, BRIEF, "b")
     broken = submit(jobs, BRIEF, "c")

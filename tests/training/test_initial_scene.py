@@ -150,6 +150,7 @@ def test_what_a_checkpoint_was_drawn_like_does_not_depend_on_points_found_again(
     assert resumed.scene.sampling == unbroken.scene.sampling
 
 
+@pytest.mark.slow(reason="compares the quality of two trainings of 300 steps")
 def test_places_that_pictures_agree_on_are_worth_their_time(filled: Capture) -> None:
     found = []
     for options in ({}, {"init.min_mask_fraction": 0.0, "init.points": 600}):

@@ -96,6 +96,7 @@ def test_a_lost_ball_makes_training_begin_again(tmp_path: Path, monkeypatch: pyt
     assert load_model(run.folder / "checkpoints" / "best").iteration == 432
 
 
+@pytest.mark.slow(reason="1,000 steps; test_run has resuming to the bit without a new attempt")
 def test_interrupted_before_and_after_it_is_the_unbroken_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
     unbroken = TrainingRun.create(capture, tmp_path / "unbroken", small())
@@ -112,6 +113,7 @@ def test_interrupted_before_and_after_it_is_the_unbroken_run(tmp_path: Path, mon
     assert all(torch.equal(value, values[name]) for name, value in one.scene.state_dict().items())
 
 
+@pytest.mark.slow(reason="three trainings of 430 steps")
 @pytest.mark.parametrize(
     "options",
     [{"time_window": 1.0}, {"iterations": ITERATIONS - 3}, {"scene.deformation": "none", "scene.residual": False}],
@@ -123,6 +125,7 @@ def test_a_choice_a_short_run_and_a_model_without_time_stay(
     assert again(train(TrainingRun.create(capture, tmp_path / "run", small(**options)), MIN_STEPS + 2)) == []
 
 
+@pytest.mark.slow(reason="430 steps; the part of a clip with few views has a test of its own below")
 def test_too_few_views_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
     path = capture / "transforms_train.json"
@@ -132,6 +135,7 @@ def test_too_few_views_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert again(train(TrainingRun.create(capture, tmp_path / "run", small()), MIN_STEPS + 2)) == []
 
 
+@pytest.mark.slow(reason="430 steps with many anchors")
 def test_what_is_trained_well_stays(tmp_path: Path) -> None:
     capture = write_synthetic(tmp_path / "c", seed=1, frames=24, size=50)
     config = make_config(

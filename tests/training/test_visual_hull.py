@@ -96,6 +96,7 @@ def test_a_clip_in_which_things_stay_in_place_begins_as_a_whole(tmp_path: Path) 
         assert (count < 30_000, window) == (True, 1.0)
 
 
+@pytest.mark.slow(reason="compares the quality of six trainings of 400 steps")
 def test_what_flies_is_not_lost(flight: Path) -> None:
     gains = []
     for seed in range(3):  # they lie a decibel apart
