@@ -72,7 +72,10 @@ def test_resuming_a_finished_run_changes_nothing(run: Path) -> None:
     assert newest_checkpoint(run) == before
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow(reason="a second process for the same path"))],
+)
 def test_an_interrupted_training_keeps_a_checkpoint_and_prints_how_to_continue(
     capture: Path, tmp_path: Path, number: signal.Signals
 ) -> None:

@@ -24,7 +24,7 @@ from jobs.queue import JobQueue
 from jobs.store import Store
 from tests.jobs.test_worker import ENDLESS, is_idle, submit, until, working
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(reason="starts a PostgreSQL server and real workers")
 
 
 def _user() -> str | None:

@@ -68,6 +68,7 @@ def test_an_error_in_the_report_is_logged_and_the_job_does_not_fail(
     assert "no report: RuntimeError: no disk" in capsys.readouterr().err
 
 
+@pytest.mark.slow(reason="a process that goes back three times; test_diverged has the same without a process")
 def test_a_training_that_diverges_ends_with_a_model_and_a_last_report(tmp_path: Path) -> None:
     store = Store(tmp_path)
     # The learning rate grows without bound: the first steps are finite, those a few dozen later are not.

@@ -98,7 +98,7 @@ def test_another_worker_continues_the_job_of_a_killed_one_and_returns_it_to_the_
     assert list(jobs.store.workers.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="seven processes that train")
 def test_jobs_are_cancelled_resumed_retried_and_finished(jobs: JobQueue) -> None:
     endless, brief = submit(jobs, ENDLESS, "a"), submit(jobs, BRIEF, "b")
     broken = submit(jobs, BRIEF, "c")

@@ -173,7 +173,7 @@ def test_two_thousand_gaussians_over_the_whole_image_fit_into_the_predicted_memo
     within("bytes at the peak", memory.taken, 1.1 * memory_model(pairs, count, 640 * 480, count, 2))
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="twelve megapixels in both precisions")
 def test_twelve_megapixels_with_gaussians_over_all_of_them_keep_their_gradient() -> None:
     """1e5 small Gaussians and 200 that fill 4000 x 3000 pixels, forward, SSIM and backward."""
     camera = pinhole(4000, 3000, focal=3000.0)

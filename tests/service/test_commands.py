@@ -22,7 +22,8 @@ from service.worker_child import WorkerChild
 LONG_S = 60.0
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+@pytest.mark.slow(reason="two processes for each signal; test_end_to_end ends with SIGTERM too")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_an_interrupted_service_stops_its_worker(tmp_path: Path, number: signal.Signals) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import pytest
 from starlette.testclient import TestClient
@@ -13,12 +14,12 @@ from jobs.job import JobError
 from jobs.store import JobFolder
 from service.app import create_app
 from service.settings import Settings
+from tests.service.conftest import queue_job
 
 
 @pytest.fixture
-def second(client: TestClient, job: str, archive: bytes) -> str:
-    answer = client.post("/jobs", params={"preset": "draft", "name": "second"}, content=archive)
-    return str(answer.json()["id"])
+def second(client: TestClient, job: str, capture: Path, archive: bytes) -> str:
+    return queue_job(client, capture, archive, "second")
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from service.settings import Settings
 from tests.jobs.test_postgres import Server, serving
 from tests.service.test_jobs import problem
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(reason="starts a PostgreSQL server")
 
 REQUESTS = 60  # more than the service has threads
 

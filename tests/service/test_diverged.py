@@ -28,7 +28,7 @@ def _refuse(constant: str) -> float:
     raise AssertionError(f"{constant} is not strict JSON")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="a worker and a training that goes back three times")
 def test_a_job_that_diverges_has_this_state_and_its_best_model_can_be_rendered(
     client: TestClient, archive: bytes, settings: Settings
 ) -> None:

@@ -49,6 +49,7 @@ def on_white_and_black(capture: Path, **options: object) -> tuple[float, float]:
     return found[0], found[1]
 
 
+@pytest.mark.slow(reason="compares the quality of two trainings of 300 steps")
 def test_a_white_object_on_white_is_opaque_on_black(tmp_path: Path) -> None:
     """With a weight that wins against the first colours, which are wrong: what they make faint nothing brings back."""
     white, black = on_white_and_black(tmp_path / "with", **{"loss.alpha": 3.0})

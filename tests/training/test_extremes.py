@@ -54,6 +54,7 @@ def _painted(
     return folder
 
 
+@pytest.mark.slow(reason="four trainings of 300 steps; powers of two below need 30 to be exact")
 @pytest.mark.parametrize("factor", [1e-4, 1e5])
 def test_tiny_and_huge_scenes_train_as_well_as_others(micro: Path, tmp_path: Path, factor: float) -> None:
     """D09: 300 iterations; units of length are a power of two times normalised ones, so rounding differs."""

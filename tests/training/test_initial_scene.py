@@ -149,6 +149,7 @@ def test_resuming_does_not_depend_on_finding_the_same_initial_points(
     assert resumed.scene.sampling == unbroken.scene.sampling
 
 
+@pytest.mark.slow(reason="compares the quality of two trainings of 300 steps")
 def test_triangulated_points_improve_quality(filled: Capture) -> None:
     found = []
     for options in ({}, {"init.min_mask_fraction": 0.0, "init.points": 600}):

@@ -96,6 +96,7 @@ def test_a_missing_ball_restarts_training(tmp_path: Path, monkeypatch: pytest.Mo
     assert load_model(run.folder / "checkpoints" / "best").iteration == 432
 
 
+@pytest.mark.slow(reason="1,000 steps; test_run has resuming to the bit without a new attempt")
 def test_interrupted_before_and_after_a_restart_it_equals_the_unbroken_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,6 +115,7 @@ def test_interrupted_before_and_after_a_restart_it_equals_the_unbroken_run(
     assert all(torch.equal(value, values[name]) for name, value in one.scene.state_dict().items())
 
 
+@pytest.mark.slow(reason="three trainings of 430 steps")
 @pytest.mark.parametrize(
     "options",
     [{"time_window": 1.0}, {"iterations": ITERATIONS - 3}, {"scene.deformation": "none", "scene.residual": False}],
@@ -125,6 +127,7 @@ def test_a_configured_window_a_short_run_and_a_static_model_do_not_restart(
     assert again(train(TrainingRun.create(capture, tmp_path / "run", small(**options)), MIN_STEPS + 2)) == []
 
 
+@pytest.mark.slow(reason="430 steps; the part of a clip with few views has a test of its own below")
 def test_too_few_views_do_not_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
     path = capture / "transforms_train.json"
@@ -134,6 +137,7 @@ def test_too_few_views_do_not_restart(tmp_path: Path, monkeypatch: pytest.Monkey
     assert again(train(TrainingRun.create(capture, tmp_path / "run", small()), MIN_STEPS + 2)) == []
 
 
+@pytest.mark.slow(reason="430 steps with many anchors")
 def test_a_clip_that_trains_well_does_not_restart(tmp_path: Path) -> None:
     capture = write_synthetic(tmp_path / "c", seed=1, frames=24, size=50)
     config = make_config(

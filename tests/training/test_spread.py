@@ -13,7 +13,7 @@ from graings.config import SceneConfig
 from graings.evaluation.evaluate import evaluate
 from tests.training.micro import GROWING, micro_trainer, plain_training, quality, steps
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(reason="six trainings of 300 or 1,000 steps")
 
 SEEDS = (0, 1, 2)
 

@@ -163,6 +163,7 @@ def test_a_growing_finite_loss_rolls_back(micro: Path, monkeypatch: pytest.Monke
     assert events[0].to_iteration == 100  # and not to a moment taken when the loss was already running away
 
 
+@pytest.mark.slow(reason="500 steps; test_diverged has runs that diverge")
 def test_a_hundredfold_rate_ends_converged_or_diverged_with_a_model_that_renders(micro: Path, tmp_path: Path) -> None:
     """E01: 500 iterations."""
     rates = {
@@ -292,6 +293,7 @@ def test_faint_anchors_are_pruned_to_make_room_for_growth(micro: Path) -> None:
     assert len(uids) <= 60
 
 
+@pytest.mark.slow(reason="compares the quality of two trainings of 400 steps")
 def test_initial_anchors_above_the_budget_are_thinned(micro: Path) -> None:
     growing = {"density.statistics_from": 0, "density.grow_from": 0, "density.grow_until": 30_000}
     eager = {"density.grow_every": 10, "density.prune_min_views": 15}
@@ -346,8 +348,15 @@ def test_single_and_double_precision_learn_alike(micro: Path) -> None:
     assert abs(single[0] - double[0]) / double[0] < 1e-5
 
 
-@pytest.mark.parametrize("projected", [True, False])
-@pytest.mark.parametrize("bias", [3.0, -3.0])
+@pytest.mark.parametrize(
+    ("bias", "projected"),
+    [
+        (3.0, True),
+        (-3.0, False),
+        pytest.param(3.0, False, marks=pytest.mark.slow(reason="230 steps more for the other combinations")),
+        pytest.param(-3.0, True, marks=pytest.mark.slow(reason="230 steps more for the other combinations")),
+    ],
+)
 def test_a_log_scale_beyond_its_clip_recovers(micro: Path, bias: float, projected: bool) -> None:
     """E09: by the image where the gradient is projected, by the regulariser alone where it is not."""
     options = {"scene.projected_clip": projected, "rates.deformation": [0.005, 0.005], "loss.deformation": 0.01}
@@ -463,7 +472,7 @@ def test_a_rotation_at_the_zero_quaternion_is_finite_and_leaves_it(micro: Path) 
         assert bool(((lengths > 0.01) & (lengths < 10)).all())
 
 
-@pytest.mark.slow
+@pytest.mark.slow(reason="10,000 steps")
 def test_ten_thousand_noisy_steps_leave_rotations_well_inside_their_bounds(micro: Path) -> None:
     """E13, all of it: once they have left zero, lengths between 0.1 and 10."""
     seen = 0

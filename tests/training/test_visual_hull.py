@@ -96,6 +96,7 @@ def test_a_clip_with_small_motion_begins_as_a_whole(tmp_path: Path) -> None:
         assert (count < 30_000, window) == (True, 1.0)
 
 
+@pytest.mark.slow(reason="compares the quality of six trainings of 400 steps")
 def test_an_object_with_large_motion_is_found(large_motion: Path) -> None:
     gains = []
     for seed in range(3):  # they lie a decibel apart
