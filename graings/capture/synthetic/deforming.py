@@ -28,6 +28,11 @@ class ClosingTorus:
         """Around the outer rim."""
         return (0.0, 0.0, 0.0), self.radius(time) + self.tube(time)
 
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The tightest."""
+        across, up = self.radius(time) + self.tube(time), self.tube(time)
+        return (-across, -across, -up), (across, across, up)
+
     def distance(self, points: Array, time: float) -> Array:
         """Exact outside."""
         across = np.sqrt(points[0] * points[0] + points[1] * points[1]) - self.radius(time)
@@ -68,6 +73,11 @@ class Flag:
         """Around the box that the sheet can reach."""
         x, y, z = 0.5 * self.width, self.amplitude * 1.25 + self.thickness, 0.5 * self.height + self.sway
         return (x, 0.0, 0.5 * self.height), math.sqrt(x * x + y * y + z * z)
+
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The box that the sheet can reach."""
+        y = self.amplitude * 1.25 + self.thickness
+        return (0.0, -y, -self.sway), (self.width, y, self.height + self.sway)
 
     def _lift(self, x: Array, time: float) -> Array:
         """Displacement [N] along z."""

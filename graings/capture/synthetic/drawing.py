@@ -19,9 +19,10 @@ from graings.capture.synthetic.shading import shade
 from graings.capture.synthetic.viewpoint import Viewpoint
 from graings.capture.synthetic.world import Instant, World
 
-RAYS_AT_ONCE: Final = 1 << 14  # few enough for the arrays to stay in the cache
-GRID: Final = 4  # rays per pixel and axis where one is not enough
-CONTRAST: Final = 0.08  # difference of neighbouring values from which on one ray is not enough
+RAYS_AT_ONCE: Final = 1 << 16  # a few tens of megabytes
+SILHOUETTE_GRID: Final = 4  # rays per pixel and axis at silhouettes
+CONTRAST_GRID: Final = 2  # and where only colours differ
+CONTRAST: Final = 0.1  # difference of neighbouring values from which on one ray is not enough
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,28 +45,36 @@ def draw(world: World, viewpoint: Viewpoint, time: float) -> DrawnView:
     covered = part >= 0
     moves = np.array([placed.part.moves for placed in instant.parts] + [False])
     alpha, moving = covered.astype(np.float64), moves[part].astype(np.float64)
-    again = np.flatnonzero(_needs_more(color, part, grazes, size))
-    offsets = (np.arange(GRID) + 0.5) / GRID
-    fine_columns = (columns[again][:, None, None] + offsets).reshape(len(again), 1, GRID)
-    fine_rows = (rows[again][:, None, None] + offsets[:, None]).reshape(len(again), GRID, 1)
-    shape = (len(again), GRID, GRID)
-    x, y = np.broadcast_to(fine_columns, shape), np.broadcast_to(fine_rows, shape)
-    fine_color, _, fine_part, _ = _cast(instant, viewpoint, x.reshape(-1), y.reshape(-1))
-    rays = GRID * GRID
-    hits = (fine_part >= 0).reshape(len(again), rays)
-    counts = hits.sum(axis=1)
-    total = np.zeros((3, len(again)))
-    for ray in range(rays):  # one after the other: a library may sum in any order
-        total = total + fine_color.reshape(3, len(again), rays)[:, :, ray]
-    color[:, again] = total / np.maximum(counts, 1)
-    alpha[again] = counts / rays
-    moving[again] = moves[fine_part].reshape(len(again), rays).sum(axis=1) / rays
+    silhouette, contrast = _needs_more(color, part, grazes, size)
+    for chosen, grid in ((silhouette, SILHOUETTE_GRID), (contrast & ~silhouette, CONTRAST_GRID)):
+        again = np.flatnonzero(chosen)
+        fine_color, fine_part = _cast_grid(instant, viewpoint, columns[again], rows[again], grid)
+        hits = fine_part >= 0
+        counts = hits.sum(axis=1)
+        total = np.zeros((3, len(again)))
+        for ray in range(grid * grid):  # one after the other: a library may sum in any order
+            total = total + fine_color[:, :, ray]
+        color[:, again] = total / np.maximum(counts, 1)
+        alpha[again] = counts / (grid * grid)
+        moving[again] = moves[fine_part].sum(axis=1) / (grid * grid)
     rgba = np.concatenate([color, alpha[None]]).T.reshape(size, size, 4)
     return DrawnView(
         rgba=np.rint(rgba * 255.0).astype(np.uint8),
         depth=np.where(covered, depth, 0.0).reshape(size, size).astype(np.float32),
         moving=np.rint(moving * 255.0).astype(np.uint8).reshape(size, size),
     )
+
+
+def _cast_grid(
+    instant: Instant, viewpoint: Viewpoint, columns: NDArray[np.int64], rows: NDArray[np.int64], grid: int
+) -> tuple[Array, NDArray[np.int64]]:
+    """Colours [3, N, grid^2] and parts [N, grid^2] on a regular grid inside pixels."""
+    count = len(columns)
+    offsets = (np.arange(grid) + 0.5) / grid
+    x = np.broadcast_to(columns[:, None, None] + offsets, (count, grid, grid)).reshape(-1)
+    y = np.broadcast_to(rows[:, None, None] + offsets[:, None], (count, grid, grid)).reshape(-1)
+    color, _, part, _ = _cast(instant, viewpoint, x, y)
+    return color.reshape(3, count, grid * grid), part.reshape(count, grid * grid)
 
 
 def _cast(
@@ -90,15 +99,18 @@ def _cast(
     return color, depth, part, grazes
 
 
-def _needs_more(color: Array, part: NDArray[np.int64], grazes: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
-    """Pixels [N] where another part or another colour is next to the centre's, or a part passes nearby."""
+def _needs_more(
+    color: Array, part: NDArray[np.int64], grazes: NDArray[np.bool_], size: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels [N] with another part next to them or passing nearby, and those with another colour next to them."""
     image, owner = color.reshape(3, size, size), part.reshape(size, size)
-    needs = grazes.reshape(size, size).copy()
+    silhouette, contrast = grazes.reshape(size, size).copy(), np.zeros((size, size), dtype=bool)
     for axis in (0, 1):
         ahead = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
         behind = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
-        differs = owner[ahead] != owner[behind]
-        differs |= np.abs(image[:, *ahead] - image[:, *behind]).max(axis=0) > CONTRAST
-        needs[ahead] |= differs
-        needs[behind] |= differs
-    return needs.reshape(-1)
+        other_part = owner[ahead] != owner[behind]
+        other_color = np.abs(image[:, *ahead] - image[:, *behind]).max(axis=0) > CONTRAST
+        for pixels, differs in ((silhouette, other_part), (contrast, other_color)):
+            pixels[ahead] |= differs
+            pixels[behind] |= differs
+    return silhouette.reshape(-1), contrast.reshape(-1)

@@ -18,6 +18,7 @@ from graings.capture.synthetic.world import Instant, Placed
 
 MAX_STEPS: Final = 160
 ON_SURFACE: Final = 1e-5  # a ray has arrived at this distance
+LONGEST_STEP: Final = 4.0  # in distances from a convex part; more would step over the place where a ray passes it
 SHADOW_STEPS: Final = 40
 SHADOW_START: Final = 0.012  # distance from a surface at which its own shadow ray begins
 OCCLUSION_HEIGHTS: Final = (0.06, 0.18)
@@ -46,10 +47,19 @@ def trace(instant: Instant, origins: Array, directions: Array, pixel: float) -> 
             owner[wall < t] = index
             t = np.minimum(t, wall)
             continue
-        rays, start, end = _near(placed, origins, directions, t, pixel)
-        if not len(rays):
+        rays, end = _near(placed, origins, directions, t, pixel)
+        origin = placed.pose.to_body(origins if origins.shape[1] == 1 else origins[:, rays])
+        direction = placed.pose.rotate_back(directions[:, rays])
+        margin = 2.0 * pixel * _furthest(placed, origins)
+        start, leave = _inside_box(placed, origin, direction, margin)
+        end = np.minimum(end, leave)
+        kept = np.flatnonzero((start < end) & (end > 0.0))
+        if not len(kept):
             continue
-        found, missed_by = _march(placed, origins, directions, rays, start, end)
+        rays, direction = rays[kept], direction[:, kept]
+        if origin.shape[1] > 1:
+            origin = origin[:, kept]
+        found, missed_by = _march(placed, origin, direction, start[kept], end[kept])
         closer = found < t[rays]
         passes[rays] = np.minimum(passes[rays], np.where(np.isfinite(found), np.inf, missed_by))
         t[rays] = np.where(closer, found, t[rays])
@@ -59,54 +69,76 @@ def trace(instant: Instant, origins: Array, directions: Array, pixel: float) -> 
 
 def _near(
     placed: Placed, origins: Array, directions: Array, limit: Array, pixel: float
-) -> tuple[NDArray[np.int64], Array, Array]:
-    """Rays that enter the bounding sphere before `limit`, and where they enter and leave it."""
+) -> tuple[NDArray[np.int64], Array]:
+    """Rays that enter the bounding sphere before `limit`, and where they leave it or reach that limit."""
     center = np.array(placed.center)[:, None]
     to_center = center - origins
     middle = dot(to_center, directions)
     square = dot(to_center, to_center)
-    distance = np.sqrt(square)
-    radius = placed.radius + 2.0 * pixel * distance
+    radius = placed.radius + 2.0 * pixel * np.sqrt(square)
     half = radius * radius - (square - middle * middle)
     rays = np.flatnonzero((half > 0.0) & (middle + radius > 0.0))
     reach = np.sqrt(half[rays])
-    start = np.maximum(middle[rays] - reach, 0.0)
-    end = middle[rays] + reach
-    useful = (start < limit[rays]) & (end > 0.0)
-    return rays[useful], start[useful], np.minimum(end[useful], limit[rays[useful]])
+    useful = (middle[rays] - reach < limit[rays]) & (middle[rays] + reach > 0.0)
+    rays, reach = rays[useful], reach[useful]
+    return rays, np.minimum(middle[rays] + reach, limit[rays])
 
 
-def _march(
-    placed: Placed, origins: Array, directions: Array, rays: NDArray[np.int64], start: Array, end: Array
-) -> tuple[Array, Array]:
-    """Where rays meet a part (infinity: nowhere), and how near they came to it per distance travelled."""
+def _furthest(placed: Placed, origins: Array) -> float:
+    """The largest distance from an origin to the part."""
+    to_center = np.array(placed.center)[:, None] - origins
+    return float(np.sqrt(dot(to_center, to_center).max())) + placed.radius
+
+
+def _inside_box(placed: Placed, origin: Array, direction: Array, margin: float) -> tuple[Array, Array]:
+    """Where rays in body coordinates enter (0 where they begin inside) and leave the box of a part."""
+    low, high = placed.part.shape.box(placed.time)
+    start, end = np.zeros(direction.shape[1]), np.full(direction.shape[1], np.inf)
+    for axis in range(3):
+        step = direction[axis]
+        inverse = 1.0 / np.where(np.abs(step) < 1e-12, 1e-12, step)
+        a = (low[axis] - margin - origin[axis]) * inverse
+        b = (high[axis] + margin - origin[axis]) * inverse
+        start = np.maximum(start, np.minimum(a, b))
+        end = np.minimum(end, np.maximum(a, b))
+    return start, end
+
+
+def _march(placed: Placed, origin: Array, direction: Array, start: Array, end: Array) -> tuple[Array, Array]:
+    """Where rays in body coordinates meet a part between `start` and `end` (infinity: nowhere), and how near they came
+    to it per distance travelled."""
     shape, time = placed.part.shape, placed.time
-    origin = placed.pose.to_body(origins if origins.shape[1] == 1 else origins[:, rays])
-    direction = placed.pose.rotate_back(directions[:, rays])
-    found = np.full(len(rays), np.inf)
-    missed_by = np.full(len(rays), np.inf)
-    active = np.arange(len(rays))
-    t, stop = start.copy(), end
-    before, step = np.zeros(len(rays)), np.zeros(len(rays))
+    found = np.full(len(start), np.inf)
+    missed_by = np.full(len(start), np.inf)
+    active = np.arange(len(start))
+    t, stop = start, end
+    before, step = np.full(len(start), np.inf), np.ones(len(start))
     shared = origin.shape[1] == 1
     for _ in range(MAX_STEPS):
         gap = shape.distance(origin + t * direction, time)
-        arrived = gap < ON_SURFACE
-        if arrived.any():
-            # One step of the secant method: the rest of the way at the rate at which the distance fell.
-            rate = np.clip((before - gap) / np.maximum(step, 1e-12), 0.02, 1.0)
-            found[active[arrived]] = (t + gap / rate)[arrived]
+        rate = (before - gap) / step  # at which the distance falls along the ray
         missed_by[active] = np.minimum(missed_by[active], gap / np.maximum(t, 1e-6))
-        going = ~arrived & (t + gap < stop)
+        arrived = np.flatnonzero(gap < ON_SURFACE)
+        if len(arrived):
+            # One step of the secant method for the rest of the way.
+            found[active[arrived]] = t[arrived] + gap[arrived] / np.clip(rate[arrived], 0.02, 1.0)
+        step = gap
+        going = (gap >= ON_SURFACE) & (t + gap < stop)
+        if shape.convex:
+            # Along a ray the distance from a convex shape is a convex function: the secant cannot lead past the
+            # surface, and where the distance grows the ray has missed.
+            going &= rate > 0.0
+            step = gap / np.clip(rate, 1.0 / LONGEST_STEP, 1.0)
+        before = gap
         if not going.all():
-            active = active[going]
-            if not len(active):
+            kept = np.flatnonzero(going)
+            if not len(kept):
                 break
-            t, gap, stop, direction = t[going], gap[going], stop[going], direction[:, going]
+            active, t, stop, direction = active[kept], t[kept], stop[kept], direction[:, kept]
+            before, step = before[kept], step[kept]
             if not shared:
-                origin = origin[:, going]
-        t = t + gap
-        before, step = gap, gap
+                origin = origin[:, kept]
+        t = t + step
     return found, missed_by
 
 
@@ -141,19 +173,24 @@ def lit_share(instant: Instant, points: Array, normals: Array, parts: NDArray[np
 
 def _penumbra(placed: Placed, points: Array, toward: Array, start: Array, end: Array, softness: float) -> Array:
     """Least ratio of the distance from the part to the half-width of the penumbra along shadow rays, in [-1, 1]."""
+    shape = placed.part.shape
     origin, direction = placed.pose.to_body(points), placed.pose.rotate_back(toward)
     ratio = np.ones(len(start))
     active, t = np.arange(len(start)), start
     stop = end
     for _ in range(SHADOW_STEPS):
-        gap = placed.part.shape.distance(origin + t * direction, placed.time)
-        ratio[active] = np.minimum(ratio[active], gap / (softness * t))
+        gap = shape.distance(origin + t * direction, placed.time)
+        now, best = gap / (softness * t), ratio[active]
+        ratio[active] = np.minimum(best, now)
         t = t + np.maximum(0.8 * np.abs(gap), 0.012)
-        going = (t < stop) & (ratio[active] > -1.0)
+        going = (t < stop) & (now > -1.0)
+        if shape.convex:  # the ratio falls and then rises
+            going &= (now <= best) | (now > 1.0)
         if not going.all():
-            active, t, stop, origin = active[going], t[going], stop[going], origin[:, going]
-            if not len(active):
+            kept = np.flatnonzero(going)
+            if not len(kept):
                 break
+            active, t, stop, origin = active[kept], t[kept], stop[kept], origin[:, kept]
     return np.clip(ratio, -1.0, 1.0)
 
 

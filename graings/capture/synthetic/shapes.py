@@ -24,6 +24,10 @@ class Shape(Protocol):
         """Centre and radius of a sphere around the shape."""
         ...
 
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """Lowest and highest corner of an upright box around the shape."""
+        ...
+
     def distance(self, points: Array, time: float) -> Array:
         """Signed distance [N]."""
         ...
@@ -35,6 +39,10 @@ class Shape(Protocol):
     def place(self, material: Array, time: float) -> Array:
         """Inverse of `material` on the surface."""
         ...
+
+
+def _mirrored(x: float, y: float, z: float) -> tuple[Vector, Vector]:
+    return (-x, -y, -z), (x, y, z)
 
 
 class Rigid:
@@ -62,6 +70,10 @@ class Ball(Rigid):
         """The sphere itself."""
         return (0.0, 0.0, 0.0), self.radius
 
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The tightest."""
+        return _mirrored(self.radius, self.radius, self.radius)
+
     def distance(self, points: Array, time: float) -> Array:
         """Exact."""
         return lengths(points) - self.radius
@@ -79,6 +91,11 @@ class RoundCone(Rigid):
         """The smallest sphere around both."""
         radius = 0.5 * (self.height + self.start + self.end)
         return (0.0, 0.0, 0.5 * (self.height + self.end - self.start)), radius
+
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The tightest."""
+        w = max(self.start, self.end)
+        return (-w, -w, -self.start), (w, w, self.height + self.end)
 
     def distance(self, points: Array, time: float) -> Array:
         """Exact."""
@@ -105,6 +122,10 @@ class Box(Rigid):
         """Through the corners."""
         return (0.0, 0.0, 0.0), math.sqrt(dot(self.half, self.half))
 
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The tightest."""
+        return _mirrored(*self.half)
+
     def distance(self, points: Array, time: float) -> Array:
         """Exact."""
         excess = np.abs(points) - (np.array(self.half)[:, None] - self.rounding)
@@ -124,6 +145,10 @@ class Disc(Rigid):
     def bound(self, time: float) -> tuple[Vector, float]:
         """Through the rims."""
         return (0.0, 0.0, 0.0), math.sqrt(self.radius * self.radius + self.half * self.half)
+
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The tightest."""
+        return _mirrored(self.radius, self.radius, self.half)
 
     def distance(self, points: Array, time: float) -> Array:
         """Exact."""
@@ -145,6 +170,10 @@ class Hoop(Rigid):
     def bound(self, time: float) -> tuple[Vector, float]:
         """Around the outer rim."""
         return (0.0, 0.0, 0.0), self.radius + self.tube
+
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The tightest."""
+        return _mirrored(self.radius + self.tube, self.radius + self.tube, self.tube)
 
     def distance(self, points: Array, time: float) -> Array:
         """Exact."""
@@ -169,6 +198,10 @@ class Spokes(Rigid):
         """Around all rods."""
         return (0.0, 0.0, 0.0), self.outer + self.tube
 
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The tightest."""
+        return _mirrored(self.outer + self.tube, self.outer + self.tube, self.tube)
+
     def distance(self, points: Array, time: float) -> Array:
         """Exact: each fold maps a point to the side of its nearest rod."""
         x, y = np.abs(points[0]), np.abs(points[1])  # two mirror planes: rods along both axes are four
@@ -192,6 +225,10 @@ class Room(Rigid):
     def bound(self, time: float) -> tuple[Vector, float]:
         """Through the corners."""
         return (0.0, 0.0, 0.0), math.sqrt(dot(self.half, self.half))
+
+    def box(self, time: float) -> tuple[Vector, Vector]:
+        """The tightest."""
+        return _mirrored(*self.half)
 
     def distance(self, points: Array, time: float) -> Array:
         """To the nearest wall, for points inside."""
