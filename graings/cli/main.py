@@ -25,6 +25,7 @@ from rich.text import Text
 
 from graings.camera.camera import Camera
 from graings.camera.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
+from graings.cli.synthesize import synthesize
 from graings.cli.terminal import metrics_line, say
 from graings.cli.training import Lists, Threads, ablate, train
 from graings.config import ConfigSection, make_config, options
@@ -88,6 +89,7 @@ def graings() -> None:
 
 
 app.command()(train)
+app.command()(synthesize)
 app.command(cls=Lists)(ablate)
 
 

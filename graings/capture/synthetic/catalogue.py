@@ -24,7 +24,7 @@ from graings.capture.synthetic.world import World
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class SuiteScene:
     """A scene: what it asks of a method, and how it is made."""
 
     name: str
@@ -33,22 +33,24 @@ class Entry:
 
 
 SUITE: Final = (
-    Entry("walker", "articulated figure: bodies linked by joints, fast limbs", walker.build),
-    Entry("crossing", "a rocket crosses a textured room: large translation, filled static background", crossing.build),
-    Entry("globe", "rotation of a fine texture", globe.build),
-    Entry("ring", "torus to sphere: change of topology", ring.build),
-    Entry("flag", "deformation of a thin sheet", flag.build),
-    Entry("sundial", "moving light: shadows and shading change, nothing moves", sundial.build),
-    Entry("chrome", "mirror ball: reflections and narrow highlights", chrome.build),
-    Entry("wheel", "thin structures: spokes, wires, hanging cabins", wheel.build),
-    Entry("room", "a room with one small mover: nine tenths are static", room.build),
-    Entry("dimmer", "exposure changes, nothing moves", dimmer.build),
-    Entry("rig", "12 fixed cameras, all instants each", rig.build),
-    Entry("still", "one instant", still.build),
+    SuiteScene("walker", "articulated figure: bodies linked by joints, fast limbs", walker.build),
+    SuiteScene(
+        "crossing", "a rocket crosses a textured room: large translation, filled static background", crossing.build
+    ),
+    SuiteScene("globe", "rotation of a fine texture", globe.build),
+    SuiteScene("ring", "torus to sphere: change of topology", ring.build),
+    SuiteScene("flag", "deformation of a thin sheet", flag.build),
+    SuiteScene("sundial", "moving light: shadows and shading change, nothing moves", sundial.build),
+    SuiteScene("chrome", "mirror ball: reflections and narrow highlights", chrome.build),
+    SuiteScene("wheel", "thin structures: spokes, wires, hanging cabins", wheel.build),
+    SuiteScene("room", "a room with one small mover: nine tenths are static", room.build),
+    SuiteScene("dimmer", "exposure changes, nothing moves", dimmer.build),
+    SuiteScene("rig", "12 fixed cameras, all instants each", rig.build),
+    SuiteScene("still", "one instant", still.build),
 )
 
 
-def scene_named(name: str) -> Entry:
+def scene_named(name: str) -> SuiteScene:
     """The entry of a scene. Raises `ValueError` with the names there are."""
     for entry in SUITE:
         if entry.name == name:

@@ -20,8 +20,11 @@ from graings.capture.synthetic.viewpoint import Viewpoint
 from graings.capture.synthetic.world import Instant, World
 
 RAYS_AT_ONCE: Final = 1 << 16  # a few tens of megabytes
-SILHOUETTE_GRID: Final = 4  # rays per pixel and axis at silhouettes
-CONTRAST_GRID: Final = 2  # and where only colours differ
+# Positions of rays in a pixel: no two in one row, column or main diagonal, so that edges of all directions are sampled
+# finely. Eight at silhouettes, four where only colours differ.
+_QUEENS: Final = (0, 4, 7, 5, 2, 6, 1, 3)
+AT_SILHOUETTES: Final = tuple(((i + 0.5) / 8, (j + 0.5) / 8) for i, j in enumerate(_QUEENS))
+AT_CONTRASTS: Final = tuple(((i + 0.5) / 4, (j + 0.5) / 4) for i, j in enumerate((1, 3, 0, 2)))
 CONTRAST: Final = 0.1  # difference of neighbouring values from which on one ray is not enough
 
 
@@ -46,17 +49,17 @@ def draw(world: World, viewpoint: Viewpoint, time: float) -> DrawnView:
     moves = np.array([placed.part.moves for placed in instant.parts] + [False])
     alpha, moving = covered.astype(np.float64), moves[part].astype(np.float64)
     silhouette, contrast = _needs_more(color, part, grazes, size)
-    for chosen, grid in ((silhouette, SILHOUETTE_GRID), (contrast & ~silhouette, CONTRAST_GRID)):
+    for chosen, offsets in ((silhouette, AT_SILHOUETTES), (contrast & ~silhouette, AT_CONTRASTS)):
         again = np.flatnonzero(chosen)
-        fine_color, fine_part = _cast_grid(instant, viewpoint, columns[again], rows[again], grid)
+        fine_color, fine_part = _cast_again(instant, viewpoint, columns[again], rows[again], offsets)
         hits = fine_part >= 0
         counts = hits.sum(axis=1)
         total = np.zeros((3, len(again)))
-        for ray in range(grid * grid):  # one after the other: a library may sum in any order
+        for ray in range(len(offsets)):  # one after the other: a library may sum in any order
             total = total + fine_color[:, :, ray]
         color[:, again] = total / np.maximum(counts, 1)
-        alpha[again] = counts / (grid * grid)
-        moving[again] = moves[fine_part].sum(axis=1) / (grid * grid)
+        alpha[again] = counts / len(offsets)
+        moving[again] = moves[fine_part].sum(axis=1) / len(offsets)
     rgba = np.concatenate([color, alpha[None]]).T.reshape(size, size, 4)
     return DrawnView(
         rgba=np.rint(rgba * 255.0).astype(np.uint8),
@@ -65,16 +68,19 @@ def draw(world: World, viewpoint: Viewpoint, time: float) -> DrawnView:
     )
 
 
-def _cast_grid(
-    instant: Instant, viewpoint: Viewpoint, columns: NDArray[np.int64], rows: NDArray[np.int64], grid: int
+def _cast_again(
+    instant: Instant,
+    viewpoint: Viewpoint,
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    offsets: tuple[tuple[float, float], ...],
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Colours [3, N, grid^2] and parts [N, grid^2] on a regular grid inside pixels."""
-    count = len(columns)
-    offsets = (np.arange(grid) + 0.5) / grid
-    x = np.broadcast_to(columns[:, None, None] + offsets, (count, grid, grid)).reshape(-1)
-    y = np.broadcast_to(rows[:, None, None] + offsets[:, None], (count, grid, grid)).reshape(-1)
+    """Colours [3, N, ray] and parts [N, ray] at the given places inside pixels."""
+    places = np.array(offsets)
+    x = (columns[:, None] + places[:, 0]).reshape(-1)
+    y = (rows[:, None] + places[:, 1]).reshape(-1)
     color, _, part, _ = _cast(instant, viewpoint, x, y)
-    return color.reshape(3, count, grid * grid), part.reshape(count, grid * grid)
+    return color.reshape(3, len(columns), len(offsets)), part.reshape(len(columns), len(offsets))
 
 
 def _cast(

@@ -22,6 +22,7 @@ LONGEST_STEP: Final = 4.0  # in distances from a convex part; more would step ov
 SHADOW_STEPS: Final = 40
 SHADOW_START: Final = 0.012  # distance from a surface at which its own shadow ray begins
 OCCLUSION_HEIGHTS: Final = (0.06, 0.18)
+THIN: Final = 0.05  # parts of less than this width take no ambient light away
 OCCLUSION: Final = 0.45  # how much of the ambient light one touching part takes away
 
 
@@ -200,6 +201,9 @@ def open_share(instant: Instant, points: Array, normals: Array, parts: NDArray[n
     top = OCCLUSION_HEIGHTS[-1]
     for index, placed in enumerate(instant.parts):
         shape = placed.part.shape
+        low, high = shape.box(placed.time)
+        if min(high[axis] - low[axis] for axis in range(3)) < THIN:
+            continue
         offset = points - np.array(placed.center)[:, None]
         limit = placed.radius + top
         close = dot(offset, offset) < limit * limit

@@ -6,16 +6,12 @@ with h half-way between the light and the viewer; mirrors show what the reflecte
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
-from graings.capture.synthetic.exact import Array, cosine, dot, smooth, units
+from graings.capture.synthetic.exact import Array, Vector, cosine, dot, smooth, units
 from graings.capture.synthetic.raycast import lit_share, open_share, trace
 from graings.capture.synthetic.world import Instant
-
-ROOM_OPEN: Final = 0.92  # ambient light in the corners is not modelled
 
 
 def shade(
@@ -47,7 +43,8 @@ def shade(
     shine = _highlight(light.direction, normals, directions, gloss, power) * lit
     colors = np.stack(
         [
-            albedo[c] * ((light.ground[c] + (light.sky[c] - light.ground[c]) * upward) * opening + light.color[c] * facing * lit)
+            albedo[c]
+            * ((light.ground[c] + (light.sky[c] - light.ground[c]) * upward) * opening + light.color[c] * facing * lit)
             + light.color[c] * shine
             for c in range(3)
         ]
@@ -62,7 +59,8 @@ def shade(
     return colors
 
 
-def _highlight(light: tuple[float, float, float], normals: Array, directions: Array, gloss: Array, power: Array) -> Array:
+def _highlight(light: Vector, normals: Array, directions: Array, gloss: Array, power: NDArray[np.int64]) -> Array:
+    """The term with h, before the light's colour."""
     result = np.zeros(len(gloss))
     glossy = np.flatnonzero(gloss > 0.0)
     if len(glossy):

@@ -54,7 +54,9 @@ class Stripes:
 
     def __call__(self, points: Array) -> Array:
         """Colours of the points."""
-        return mixed(_step(sine(dot(self.axis, points) / self.period + self.phase), self.sharpness), self.low, self.high)
+        return mixed(
+            _step(sine(dot(self.axis, points) / self.period + self.phase), self.sharpness), self.low, self.high
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,7 @@ class Marble:
 
 @dataclass(frozen=True, slots=True)
 class Globe:
-    """A map: land and sea with coasts, ice at the poles, and a grid of meridians and parallels on a unit-free sphere."""
+    """A map of land, sea and ice with a grid of meridians and parallels, on a sphere around the origin."""
 
     seed: int
 
@@ -132,7 +134,9 @@ class Globe:
         for _ in range(2):  # the angle four times over
             c, s = c * c - s * s, 2.0 * c * s
         c, s = c * (c * c - 3.0 * s * s), s * (3.0 * c * c - s * s)  # and that three times
-        meridian = np.clip(1.4 - np.abs(s) * across * 5.0, 0.0, 1.0) * np.clip((0.97 - np.abs(direction[2])) * 20.0, 0.0, 1.0)
+        meridian = np.clip(1.4 - np.abs(s) * across * 5.0, 0.0, 1.0) * np.clip(
+            (0.97 - np.abs(direction[2])) * 20.0, 0.0, 1.0
+        )
         parallel = np.clip(1.4 - np.abs(sine(direction[2] * 2.5)) * 5.0, 0.0, 1.0)
         line = 0.75 * np.maximum(meridian, parallel)
         return colors + (np.array(rgb("fff6d8"))[:, None] - colors) * line

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from graings.capture.synthetic.exact import Array, Vector, cosine, cross, lengths, sine, unit
-from graings.capture.synthetic.world import Path
+from graings.capture.synthetic.world import CameraPath
 
 GOLDEN: Final = 0.6180339887498949  # (sqrt(5) - 1) / 2: steps of it fill an interval evenly however many there are
 ELEVATION_STEP: Final = 0.5401815134754528  # golden^2 * sqrt(2)
@@ -67,7 +67,7 @@ def look(origin: Vector, target: Vector, focal: float, size: int) -> Viewpoint:
     return Viewpoint(origin, right, cross(forward, right), forward, focal, size)
 
 
-def on_path(path: Path, index: int, start: float, size: int) -> Viewpoint:
+def on_path(path: CameraPath, index: int, start: float, size: int) -> Viewpoint:
     """Camera number `index` of a sequence that begins at `start` in [0, 1)."""
     a, b = start + index * GOLDEN, start + index * ELEVATION_STEP
     azimuth = path.azimuth[0] + (path.azimuth[1] - path.azimuth[0]) * (a - math.floor(a))
@@ -75,14 +75,14 @@ def on_path(path: Path, index: int, start: float, size: int) -> Viewpoint:
     return _around(path, azimuth, elevation, size)
 
 
-def on_rig(path: Path, index: int, count: int, size: int) -> Viewpoint:
+def on_rig(path: CameraPath, index: int, count: int, size: int) -> Viewpoint:
     """Fixed camera `index` of `count`: spread over the azimuth, at three heights in turn."""
     azimuth = path.azimuth[0] + (path.azimuth[1] - path.azimuth[0]) * index / count
     elevation = path.elevation[0] + (path.elevation[1] - path.elevation[0]) * (index % 3) / 2
     return _around(path, azimuth, elevation, size)
 
 
-def _around(path: Path, azimuth: float, elevation: float, size: int) -> Viewpoint:
+def _around(path: CameraPath, azimuth: float, elevation: float, size: int) -> Viewpoint:
     reach, height = path.distance * cosine(elevation), path.distance * sine(elevation)
     x, y, z = path.target
     origin = (x + reach * cosine(azimuth), y + reach * sine(azimuth), z + height)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -13,12 +13,14 @@ from graings.capture.synthetic.pose import STILL, Pose
 from graings.capture.synthetic.shapes import Shape
 from graings.capture.synthetic.textures import Texture
 
+_SLANTING: Final = unit((0.45, -0.35, 0.82))
+
 
 @dataclass(frozen=True, slots=True)
 class Light:
     """A distant light and what comes from all around; linear colours."""
 
-    direction: Vector = unit((0.45, -0.35, 0.82))  # towards the light
+    direction: Vector = _SLANTING  # towards the light
     color: Vector = (0.92, 0.86, 0.76)
     sky: Vector = (0.34, 0.38, 0.46)  # ambient light on a surface that faces up
     ground: Vector = (0.20, 0.17, 0.15)  # and on one that faces down
@@ -44,7 +46,7 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class CameraPath:
     """Where the cameras are: on a sphere around `target`, within ranges of azimuth and elevation (turns)."""
 
     distance: float = 4.0
@@ -76,7 +78,7 @@ class World:
     """
 
     parts: tuple[Part, ...]
-    path: Path = field(default_factory=Path)
+    path: CameraPath = field(default_factory=CameraPath)
     light: Callable[[float], Light] = constant_light
     exposure: Callable[[float], float] = full_exposure
     room: bool = False

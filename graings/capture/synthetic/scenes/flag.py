@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from graings.capture.synthetic.deforming import Flag
 from graings.capture.synthetic.exact import Array, sine
 from graings.capture.synthetic.pose import at
-from graings.capture.synthetic.scenes.plate import plate, resting
+from graings.capture.synthetic.scenes.plate import resting
 from graings.capture.synthetic.shapes import Ball, Disc, RoundCone
 from graings.capture.synthetic.textures import Plain, mixed, rgb
-from graings.capture.synthetic.world import Part, Path, World
+from graings.capture.synthetic.world import CameraPath, Part, World
 
-import numpy as np
-
-WIDTH, HEIGHT = 1.45, 0.95
+WIDTH, HEIGHT = 1.5, 1.0
 
 
 def _pattern(material: Array) -> Array:
@@ -43,8 +43,5 @@ def build(seed: int) -> World:
             Part(Ball(0.06), Plain(rgb("d9a93a")), pose=resting((-0.745, 0.0, 0.84)), gloss=0.5),
             Part(sheet, _pattern, pose=lambda time: hung, moves=True),
         ),
-        Path(elevation=(0.01, 0.1), target=(0.0, 0.0, -0.05)),
+        CameraPath(distance=3.7, elevation=(0.01, 0.1), target=(0.0, 0.0, -0.08)),
     )
-
-
-_ = plate

@@ -6,7 +6,7 @@ from graings.capture.synthetic.pose import Pose, at
 from graings.capture.synthetic.scenes.plate import plate, resting
 from graings.capture.synthetic.shapes import Ball, Disc, Hoop, RoundCone
 from graings.capture.synthetic.textures import Globe, Marble, Plain, rgb
-from graings.capture.synthetic.world import Part, Path, World
+from graings.capture.synthetic.world import CameraPath, Part, World
 
 TILT = 0.065
 
@@ -32,5 +32,5 @@ def build(seed: int) -> World:
             Part(Ball(0.76), Globe(seed + 7), pose=_turning, moves=True, gloss=0.12),
             Part(Ball(0.06), brass, pose=lambda time: _tilted(time).moved(0.0, 0.0, 0.84), gloss=0.4),
         ),
-        Path(target=(0.0, 0.0, 0.02)),
+        CameraPath(target=(0.0, 0.0, 0.02)),
     )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from graings.capture.synthetic.pose import at
+from collections.abc import Callable
+
+from graings.capture.synthetic.exact import Vector
+from graings.capture.synthetic.pose import Pose, at
 from graings.capture.synthetic.shapes import Disc
 from graings.capture.synthetic.textures import Checker, Texture, rgb
 from graings.capture.synthetic.world import Part
@@ -17,7 +20,7 @@ def plate(top: float, radius: float = 1.05, texture: Texture | None = None) -> P
     return Part(Disc(radius, HALF), pattern, pose=lambda time: pose)
 
 
-def resting(part_pose: tuple[float, float, float], turns: float = 0.0):  # type: ignore[no-untyped-def]
+def resting(place: Vector, turns: float = 0.0) -> Callable[[float], Pose]:
     """Pose function of a body that rests at a place, turned about the vertical."""
-    pose = at(*part_pose).turned("z", turns)
+    pose = at(*place).turned("z", turns)
     return lambda time: pose

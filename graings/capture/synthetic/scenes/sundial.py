@@ -9,7 +9,7 @@ from graings.capture.synthetic.pose import at
 from graings.capture.synthetic.scenes.plate import plate, resting
 from graings.capture.synthetic.shapes import Ball, Box, Disc, Hoop, RoundCone
 from graings.capture.synthetic.textures import Checker, Marble, Plain, rgb
-from graings.capture.synthetic.world import Light, Part, Path, World
+from graings.capture.synthetic.world import CameraPath, Light, Part, World
 
 
 def _light(time: float) -> Light:
@@ -37,6 +37,6 @@ def build(seed: int) -> World:
             Part(Disc(0.13, 0.2), Plain(rgb("c2503a")), pose=resting((0.35, -0.5, -0.35)), gloss=0.1),
             Part(RoundCone(0.34, 0.17, 0.03), Plain(rgb("6f9a4a")), pose=resting((-0.5, -0.42, -0.38))),
         ),
-        Path(elevation=(0.06, 0.18), target=(0.0, 0.0, -0.3)),
+        CameraPath(elevation=(0.06, 0.18), target=(0.0, 0.0, -0.36), distance=3.8),
         light=_light,
     )

@@ -9,7 +9,7 @@ from graings.capture.synthetic.pose import Pose, at
 from graings.capture.synthetic.scenes.plate import plate
 from graings.capture.synthetic.shapes import Ball, RoundCone, Shape
 from graings.capture.synthetic.textures import Layered, Plain, Stripes, Texture, rgb
-from graings.capture.synthetic.world import Part, Path, World
+from graings.capture.synthetic.world import CameraPath, Part, World
 
 CYCLES = 2.0
 SKIN, SHIRT, DARK = rgb("e2a57e"), rgb("d8432f"), rgb("26344d")
@@ -21,14 +21,22 @@ def _root(time: float) -> Pose:
 
 
 def _chest(time: float) -> Pose:
-    return _root(time).moved(0.0, 0.0, 0.1).turned("y", 0.03 * sine(CYCLES * time)).turned("z", 0.04 * sine(CYCLES * time))
+    return (
+        _root(time).moved(0.0, 0.0, 0.1).turned("y", 0.03 * sine(CYCLES * time)).turned("z", 0.04 * sine(CYCLES * time))
+    )
 
 
 def _arm(side: float) -> Callable[[float], Pose]:
     def pose(time: float) -> Pose:
         lift = 0.06 + 0.2 * (1.0 - cosine(CYCLES * time))  # turns away from hanging down
         swing = 0.10 * side * sine(CYCLES * time)
-        return _chest(time).moved(0.0, 0.22 * side, 0.34).turned("y", swing).turned("x", side * (0.5 - 0.0)).turned("x", side * lift)
+        return (
+            _chest(time)
+            .moved(0.0, 0.22 * side, 0.34)
+            .turned("y", swing)
+            .turned("x", 0.5 * side)
+            .turned("x", side * lift)
+        )
 
     return pose
 
@@ -70,7 +78,7 @@ def build(seed: int) -> World:
     shirt = Stripes(SHIRT, rgb("f4efe4"), (0.0, 0.0, 1.0), 0.13, 0.2)
     head = Layered(Plain(SKIN), Plain(rgb("4a2f1d")), 2, 0.06, 0.03)
     parts = [
-        plate(-0.93, 1.0),
+        plate(-0.93, 0.8),
         limb(RoundCone(0.12, 0.14, 0.15), Plain(DARK), _root),
         limb(RoundCone(0.26, 0.15, 0.19), shirt, _chest),
         limb(RoundCone(0.16, 0.07, 0.06), Plain(SKIN), _after(_chest, 0.0, 0.0, 0.4)),
@@ -86,7 +94,7 @@ def build(seed: int) -> World:
             limb(RoundCone(0.32, 0.08, 0.055), Stripes(DARK, rgb("3f5f8c"), (0.0, 0.0, 1.0), 0.11), _shin(side)),
             limb(RoundCone(0.14, 0.07, 0.05), Plain(rgb("f2c230")), _foot(side)),
         ]
-    return World(tuple(parts), Path(target=(0.0, 0.0, -0.05)))
+    return World(tuple(parts), CameraPath(distance=3.9, target=(0.0, 0.0, -0.08)))
 
 
 def _foot(side: float) -> Callable[[float], Pose]:

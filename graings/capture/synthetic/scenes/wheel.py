@@ -9,7 +9,7 @@ from graings.capture.synthetic.pose import Pose, along, at
 from graings.capture.synthetic.scenes.plate import plate
 from graings.capture.synthetic.shapes import Ball, Box, Hoop, RoundCone, Spokes
 from graings.capture.synthetic.textures import Layered, Plain, rgb
-from graings.capture.synthetic.world import Part, Path, World
+from graings.capture.synthetic.world import CameraPath, Part, World
 
 CENTER = (0.0, 0.0, 0.12)
 RADIUS, DEPTH, TURNS = 0.78, 0.11, 0.3
@@ -35,6 +35,11 @@ def _below(pose: Callable[[float], Pose], distance: float) -> Callable[[float], 
     return lambda time: pose(time).moved(0.0, 0.0, -distance)
 
 
+def _axle(pose: Callable[[float], Pose]) -> Callable[[float], Pose]:
+    """A rod between the two rims, on which a cabin hangs."""
+    return lambda time: pose(time).moved(0.0, -0.1, 0.0).turned("x", -0.25)
+
+
 def _rod(start: tuple[float, float, float], end: tuple[float, float, float], radius: float, color: str) -> Part:
     pose, length = along(start, end)
     return Part(RoundCone(length, radius, radius), Plain(rgb(color)), pose=lambda time: pose, gloss=0.2)
@@ -58,8 +63,12 @@ def build(seed: int) -> World:
         pose = _cabin(index)
         tub = Layered(Plain(rgb(colors[index % 4])), Plain(rgb("f4efe2")), 2, 0.02)
         parts += [
-            Part(RoundCone(0.2, 0.012, 0.012), white, pose=lambda time, p=pose: p(time).moved(0.0, -0.1, 0.0).turned("x", -0.25), moves=True),
+            Part(
+                RoundCone(0.2, 0.012, 0.012),
+                white,
+                pose=_axle(pose),
+                moves=True,
+            ),
             Part(Box((0.085, 0.075, 0.065), 0.03), tub, pose=_below(pose, 0.13), moves=True, gloss=0.1),
-            Part(RoundCone(0.1, 0.008, 0.008), white, pose=_below(pose, 0.1), moves=True),
         ]
-    return World(tuple(parts), Path(elevation=(0.01, 0.11), target=(0.0, 0.0, -0.02)))
+    return World(tuple(parts), CameraPath(distance=4.1, elevation=(0.01, 0.11), target=(0.0, 0.0, -0.1)))
