@@ -34,9 +34,7 @@ class SuiteScene:
 
 SUITE: Final = (
     SuiteScene("walker", "articulated figure: bodies linked by joints, fast limbs", walker.build),
-    SuiteScene(
-        "crossing", "a rocket crosses a textured room: large translation, filled static background", crossing.build
-    ),
+    SuiteScene("crossing", "a body crosses a textured room: large translation, filled background", crossing.build),
     SuiteScene("globe", "rotation of a fine texture", globe.build),
     SuiteScene("ring", "torus to sphere: change of topology", ring.build),
     SuiteScene("flag", "deformation of a thin sheet", flag.build),

@@ -206,7 +206,7 @@ class Spokes(Rigid):
         """Exact: each fold maps a point to the side of its nearest rod."""
         x, y = np.abs(points[0]), np.abs(points[1])  # two mirror planes: rods along both axes are four
         c, s = 0.0, 1.0  # of the quarter turn
-        for _ in range(self.folds - 1):
+        for _ in range(self.folds):
             # Mirror at half of the present wedge, whose upper edge is at the angle with cosine c and sine s.
             c, s = math.sqrt(0.5 * (1.0 + c)), math.sqrt(0.5 * (1.0 - c))
             over = np.maximum(y * c - x * s, 0.0)

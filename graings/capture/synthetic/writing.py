@@ -105,5 +105,6 @@ def _write(path: Path, pixels: NDArray[np.uint8] | NDArray[np.float32]) -> None:
     if path.suffix == ".exr":
         spec.channelnames = ("Z",)
         spec["compression"] = "zip"
+        spec["DateTime"] = "2000:01:01 00:00:00"  # else the file holds the time of writing
     if output is None or not (output.open(str(path), spec) and output.write_image(pixels) and output.close()):
         raise OSError(f"cannot write {path}: {oiio.geterror() if output is None else output.geterror()}")
