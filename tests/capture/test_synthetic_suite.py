@@ -61,8 +61,8 @@ def digest(folder: Path) -> str:
 def test_a_scene_loads_through_the_reader(suite: Path, name: str) -> None:
     capture: Capture = load_capture(suite / name)
     assert len(capture.train) == (24 if name == "rig" else VIEWS)
-    assert len(capture.val) == 2
-    assert len(capture.test) == 3
+    assert len(capture.val) == 1
+    assert len(capture.test) == 2
     assert capture.has_alpha == (name not in ROOMS)
     images = ImageStore((1.0, 1.0, 1.0), 16)
     for frame in capture.train[:2]:
@@ -154,11 +154,11 @@ def test_the_rig_sees_every_instant_from_twelve_cameras(suite: Path) -> None:
 
 
 def test_the_same_seed_gives_the_same_bytes(suite: Path, tmp_path: Path) -> None:
-    for name in ("chrome", "flag"):
-        again = synthesize(name, tmp_path / name, size=SIZE, views=VIEWS, seed=SEED)
-        assert digest(again) == digest(suite / name)
-        other = synthesize(name, tmp_path / f"{name}_other", size=SIZE, views=VIEWS, seed=SEED + 1)
-        assert digest(other) != digest(suite / name)
+    name = "chrome"
+    again = synthesize(name, tmp_path / name, size=SIZE, views=VIEWS, seed=SEED)
+    assert digest(again) == digest(suite / name)
+    other = synthesize(name, tmp_path / f"{name}_other", size=SIZE, views=VIEWS, seed=SEED + 1)
+    assert digest(other) != digest(suite / name)
 
 
 PIXELS = """
@@ -213,7 +213,7 @@ def test_the_number_of_processes_changes_no_byte(suite: Path, tmp_path: Path) ->
         observe=lambda *done: seen.append(done),
     )
     assert digest(again) == digest(suite / "globe")
-    assert seen == [(index, 11) for index in range(1, 12)]
+    assert seen == [(index, 8) for index in range(1, 9)]
 
 
 def test_a_wrong_request_is_refused(tmp_path: Path) -> None:

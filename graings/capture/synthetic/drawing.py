@@ -49,38 +49,32 @@ def draw(world: World, viewpoint: Viewpoint, time: float) -> DrawnView:
     moves = np.array([placed.part.moves for placed in instant.parts] + [False])
     alpha, moving = covered.astype(np.float64), moves[part].astype(np.float64)
     silhouette, contrast = _needs_more(color, part, grazes, size)
-    for chosen, offsets in ((silhouette, AT_SILHOUETTES), (contrast & ~silhouette, AT_CONTRASTS)):
-        again = np.flatnonzero(chosen)
-        fine_color, fine_part = _cast_again(instant, viewpoint, columns[again], rows[again], offsets)
-        hits = fine_part >= 0
-        counts = hits.sum(axis=1)
-        total = np.zeros((3, len(again)))
-        for ray in range(len(offsets)):  # one after the other: a library may sum in any order
-            total = total + fine_color[:, :, ray]
-        color[:, again] = total / np.maximum(counts, 1)
-        alpha[again] = counts / len(offsets)
-        moving[again] = moves[fine_part].sum(axis=1) / len(offsets)
+    groups = [
+        (np.flatnonzero(silhouette), np.array(AT_SILHOUETTES)),
+        (np.flatnonzero(contrast & ~silhouette), np.array(AT_CONTRASTS)),
+    ]
+    fine_columns = np.concatenate([(columns[again][:, None] + offsets[:, 0]).reshape(-1) for again, offsets in groups])
+    fine_rows = np.concatenate([(rows[again][:, None] + offsets[:, 1]).reshape(-1) for again, offsets in groups])
+    fine_color, _, fine_part, _ = _cast(instant, viewpoint, fine_columns, fine_rows)
+    first = 0
+    for again, offsets in groups:
+        count, rays = len(again), len(offsets)
+        colors = fine_color[:, first : first + count * rays].reshape(3, count, rays)
+        parts = fine_part[first : first + count * rays].reshape(count, rays)
+        first += count * rays
+        hits = (parts >= 0).sum(axis=1)
+        total = np.zeros((3, count))
+        for ray in range(rays):  # one after the other: a library may sum in any order
+            total = total + colors[:, :, ray]
+        color[:, again] = total / np.maximum(hits, 1)
+        alpha[again] = hits / rays
+        moving[again] = moves[parts].sum(axis=1) / rays
     rgba = np.concatenate([color, alpha[None]]).T.reshape(size, size, 4)
     return DrawnView(
         rgba=np.rint(rgba * 255.0).astype(np.uint8),
         depth=np.where(covered, depth, 0.0).reshape(size, size).astype(np.float32),
         moving=np.rint(moving * 255.0).astype(np.uint8).reshape(size, size),
     )
-
-
-def _cast_again(
-    instant: Instant,
-    viewpoint: Viewpoint,
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    offsets: tuple[tuple[float, float], ...],
-) -> tuple[Array, NDArray[np.int64]]:
-    """Colours [3, N, ray] and parts [N, ray] at the given places inside pixels."""
-    places = np.array(offsets)
-    x = (columns[:, None] + places[:, 0]).reshape(-1)
-    y = (rows[:, None] + places[:, 1]).reshape(-1)
-    color, _, part, _ = _cast(instant, viewpoint, x, y)
-    return color.reshape(3, len(columns), len(offsets)), part.reshape(len(columns), len(offsets))
 
 
 def _cast(

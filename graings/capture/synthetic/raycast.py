@@ -60,7 +60,7 @@ def trace(instant: Instant, origins: Array, directions: Array, pixel: float) -> 
         rays, direction = rays[kept], direction[:, kept]
         if origin.shape[1] > 1:
             origin = origin[:, kept]
-        found, missed_by = _march(placed, origin, direction, start[kept], end[kept])
+        found, missed_by = march(placed, origin, direction, start[kept], end[kept])
         closer = found < t[rays]
         passes[rays] = np.minimum(passes[rays], np.where(np.isfinite(found), np.inf, missed_by))
         t[rays] = np.where(closer, found, t[rays])
@@ -105,7 +105,7 @@ def _inside_box(placed: Placed, origin: Array, direction: Array, margin: float) 
     return start, end
 
 
-def _march(placed: Placed, origin: Array, direction: Array, start: Array, end: Array) -> tuple[Array, Array]:
+def march(placed: Placed, origin: Array, direction: Array, start: Array, end: Array) -> tuple[Array, Array]:
     """Where rays in body coordinates meet a part between `start` and `end` (infinity: nowhere), and how near they came
     to it per distance travelled."""
     shape, time = placed.part.shape, placed.time

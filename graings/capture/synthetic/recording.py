@@ -45,9 +45,9 @@ def shots(world: World, *, size: int, views: int, seed: int) -> dict[str, list[S
             Shot(f"train/r_{index:03d}", on_path(world.path, index, starts[0], size), times[index % instants])
             for index in range(views)
         ]
-    held_out = {"val": max(2, views // 10), "test": max(3, views // 8)}
+    held_out = {"val": max(1, views // 10), "test": max(2, views // 8)}
     if instants > 1:
-        held_out["between"] = max(3, views // 8)
+        held_out["between"] = max(2, views // 8)
     for number, (split, count) in enumerate(held_out.items(), start=1):
         between = split == "between"
         intervals = instants - 1 if between else instants

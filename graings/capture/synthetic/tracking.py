@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graings.capture.synthetic.exact import Array, dot, uniform, units
+from graings.capture.synthetic.raycast import march
 from graings.capture.synthetic.shapes import Room
 from graings.capture.synthetic.world import Placed, World
 
-CANDIDATES: Final = 12  # chords for each point that is wanted: some miss, and some points lie inside other parts
+CANDIDATES: Final = 8  # chords for each point that is wanted: some miss, and some points lie inside other parts
 REFINEMENTS: Final = 40
 ON_SURFACE: Final = 1e-6
 CHECKS: Final = 16  # times at which a point must lie outside all other parts
@@ -66,14 +67,18 @@ def _on_surface(placed: Placed, numbers: Array) -> tuple[Array, NDArray[np.int64
     low, high = (np.array(corner)[:, None] for corner in shape.box(time))
     through = low + (high - low) * numbers[:3]
     direction = units(2.0 * numbers[3:] - 1.0)
-    points = through - 2.0 * placed.radius * direction
-    for _ in range(4 * REFINEMENTS):
-        points = points + np.maximum(shape.distance(points, time), 0.0) * direction
-    near = np.flatnonzero(np.abs(shape.distance(points, time)) < 1e-3)
-    points = points[:, near]
+    origins = through - 2.0 * placed.radius * direction
+    count = direction.shape[1]
+    reach, _ = march(placed, origins, direction, np.zeros(count), np.full(count, 4.0 * placed.radius))
+    near = np.flatnonzero(np.isfinite(reach))
+    points = origins[:, near] + reach[near] * direction[:, near]
+    gap = shape.distance(points, time)
     for _ in range(REFINEMENTS):
-        points = points - shape.distance(points, time) * _gradient(placed, points)
-    exact = np.abs(shape.distance(points, time)) < 0.1 * ON_SURFACE
+        if np.abs(gap).max(initial=0.0) < 1e-3 * ON_SURFACE:
+            break
+        points = points - gap * _gradient(placed, points)
+        gap = shape.distance(points, time)
+    exact = np.abs(gap) < 0.1 * ON_SURFACE
     return points[:, exact], near[exact]
 
 
