@@ -249,8 +249,8 @@ def main() -> None:
     figure.savefig(options.output / "raster_precision.svg")
     document = {
         "schema": "graings.work_precision/1",
-        "machine": machine_facts(),
-        "versions": version_facts(),
+        "machine": machine_facts().to_json(),
+        "versions": version_facts().to_json(),
         "reference": {"what": "float64, no cut-offs", "floor": disagreement},
         "scene": {"gaussians": options.gaussians, "size": options.size, "pairs": bench.pairs},
         "render": _part("render", render),

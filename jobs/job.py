@@ -24,6 +24,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from jobs.progress import ProgressReport
+
 ID_PATTERN = r"^[0-9a-f]{16}$"
 _ID = re.compile(ID_PATTERN)
 
@@ -104,7 +106,7 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job as a front end sees it. Times are Unix seconds; `progress` is the trainer's last report as JSON.
+    """A job as a front end sees it. Times are Unix seconds; `progress` is the trainer's last report.
 
     `checkpoint` is the iteration of the newest one.
     """
@@ -116,7 +118,7 @@ class Job:
     started_at: float | None
     finished_at: float | None
     attempts: int
-    progress: dict[str, Any] | None
+    progress: ProgressReport | None
     checkpoint: int | None
     has_metrics: bool
     has_model: bool

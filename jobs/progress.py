@@ -1,22 +1,55 @@
 """Progress: what a training job reports, as JSON lines in a file.
 
-The trainer appends; anybody may read while it does. A position in the file is an event's id, so that a reader who
-lost the connection goes on exactly where it was. Knows nothing of who reads.
+The trainer appends; other processes may read at the same time. A position in the file is the id of a report, so that
+a reader whose connection broke continues exactly where it was.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-_TAIL_BYTES = 16_384  # many times the longest line
+from pydantic import BeforeValidator, Field, ValidationError
+
+from graings.document import Document
+from graings.report.events import Event
+
+_TAIL_BYTES = 65_536  # many times the longest line
+
+
+def _finite(value: Any) -> Any:
+    """The value, or None for a number that JSON does not have."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Number = Annotated[float | None, BeforeValidator(_finite)]
+
+
+class ProgressReport(Document):
+    """One report of the trainer. Numbers are null where there is no step yet or where they are not finite."""
+
+    phase: Literal["loading", "warmup", "joint", "static", "diverged"] = Field(description="What the trainer does.")
+    iteration: int = Field(ge=0, description="Iterations done.")
+    iterations: int = Field(
+        ge=0, description="Iterations of the whole run. They grow when training is restarted (event `restart`)."
+    )
+    attempt: int = Field(ge=0, description="Number of this start of the trainer, from 1.")
+    loss: Number = Field(None, description="Loss of the last step.")
+    psnr: Number = Field(None, description="Mean PSNR of the training views of the last step, in dB.")
+    gaussians: int | None = Field(None, ge=0, description="Gaussians drawn in any view of the last step.")
+    anchors: int | None = Field(None, ge=0, description="Anchors of the scene.")
+    iterations_per_s: Number = Field(None, description="Iterations per second over the last few seconds.")
+    eta_s: Number = Field(None, description="Seconds of training left at this rate.")
+    train_s: Number = Field(None, description="Seconds of training so far, evaluations not counted.")
+    held_out_psnr: Number = Field(None, description="PSNR of the last evaluation of this attempt, in dB.")
+    held_out_ssim_3dgs: Number = Field(None, description="SSIM of the last evaluation of this attempt.")
+    events: tuple[Event, ...] = Field((), description="What happened in the last step, beside an ordinary step.")
 
 
 class ProgressWriter:
-    """Appends lines to a progress file; a line torn by a crash is closed off first."""
+    """Appends reports to a progress file; a line that a crash left incomplete is ended first."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("ab", buffering=0)
@@ -26,26 +59,26 @@ class ProgressWriter:
                 if old.read(1) != b"\n":
                     self._file.write(b"\n")
 
-    def write(self, values: dict[str, Any]) -> None:
-        """Append one line. Numbers that JSON does not have become null."""
-        strict = {key: _finite(value) for key, value in values.items()}
-        # One write call, so that a reader never sees half a line for longer than the kernel takes to copy it.
-        self._file.write(json.dumps(strict, allow_nan=False, separators=(",", ":")).encode() + b"\n")
+    def write(self, report: ProgressReport) -> None:
+        """Append one report."""
+        # A single write, so that a reader hardly ever sees half a line.
+        self._file.write(report.model_dump_json().encode() + b"\n")
 
     def close(self) -> None:
         self._file.close()
 
 
-def last_progress(path: Path) -> dict[str, Any] | None:
-    """The newest whole line, or None."""
-    lines, _ = read_progress(path, max(0, _size(path) - _TAIL_BYTES))
-    return lines[-1][1] if lines else None
+def last_progress(path: Path) -> ProgressReport | None:
+    """The newest complete report, or None."""
+    reports, _ = read_progress(path, max(0, _size(path) - _TAIL_BYTES))
+    return reports[-1][1] if reports else None
 
 
-def read_progress(path: Path, start: int) -> tuple[list[tuple[int, dict[str, Any]]], int]:
-    """Whole lines from byte `start` on, each with the position after it, and the position to go on from.
+def read_progress(path: Path, start: int) -> tuple[list[tuple[int, ProgressReport]], int]:
+    """Complete reports from byte `start` on, each with the position after it, and the position to continue from.
 
-    A `start` in the middle of a line skips the rest of that line; one beyond the end counts as the end.
+    A `start` in the middle of a line skips the rest of that line; one beyond the end counts as the end. A line that is
+    no report, such as one that a crash left incomplete, is skipped.
     """
     if not path.exists():
         return [], start
@@ -53,40 +86,34 @@ def read_progress(path: Path, start: int) -> tuple[list[tuple[int, dict[str, Any
         start = min(start, file.seek(0, os.SEEK_END))
         if start > 0:
             file.seek(start - 1)
-            file.readline()  # nothing but the newline itself where `start` is the beginning of a line
+            file.readline()  # only the newline itself where `start` is the beginning of a line
             start = file.tell()
         file.seek(start)
         content = file.read()
-    found: list[tuple[int, dict[str, Any]]] = []
+    reports: list[tuple[int, ProgressReport]] = []
     position = start
     for line in content.splitlines(keepends=True):
         if not line.endswith(b"\n"):
             break
         position += len(line)
-        values = _parse(line)
-        if values is not None:
-            found.append((position, values))
-    return found, position
+        report = _parse(line)
+        if report is not None:
+            reports.append((position, report))
+    return reports, position
 
 
 def last_start(path: Path) -> int:
-    """Where the newest whole line begins, for readers who want it and what follows."""
-    lines, end = read_progress(path, max(0, _size(path) - _TAIL_BYTES))
-    return lines[-2][0] if len(lines) > 1 else (0 if end <= _TAIL_BYTES else end)
+    """Where the newest complete report begins, for readers who want it and what follows."""
+    reports, end = read_progress(path, max(0, _size(path) - _TAIL_BYTES))
+    return reports[-2][0] if len(reports) > 1 else (0 if end <= _TAIL_BYTES else end)
 
 
 def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
-def _parse(line: bytes) -> dict[str, Any] | None:
-    """A line as an object; None for one that was torn by a crash."""
+def _parse(line: bytes) -> ProgressReport | None:
     try:
-        values = json.loads(line)
-    except ValueError:
+        return ProgressReport.model_validate_json(line)
+    except ValidationError:
         return None
-    return values if isinstance(values, dict) else None
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

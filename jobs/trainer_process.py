@@ -24,12 +24,13 @@ from typing import Any
 
 from graings.config import TrainConfig, restored
 from graings.errors import DivergedError, GraingsError
+from graings.report.events import Diverged
 from graings.report.folder import report_runs
 from graings.training.run import RunReport, TrainingRun
 from jobs.exit_code import ExitCode
 from jobs.files import locked
 from jobs.parent import watch_parent
-from jobs.progress import ProgressWriter
+from jobs.progress import ProgressReport, ProgressWriter
 from jobs.store import JobFolder, Store
 
 REPORT_EVERY_S = 1.0
@@ -85,8 +86,9 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     starts = folder.attempts()  # the last ones
     attempt = starts[-1].number if starts else 1
     progress = ProgressWriter(folder.progress)
-    beginning = {"iteration": checkpoint or 0, "iterations": config.iterations, "attempt": attempt}
-    progress.write({"phase": "loading", **beginning})
+    progress.write(
+        ProgressReport(phase="loading", iteration=checkpoint or 0, iterations=config.iterations, attempt=attempt)
+    )
     if checkpoint is None:
         shutil.rmtree(folder.run, ignore_errors=True)  # what a start without a checkpoint left is worth nothing
         run = TrainingRun.create(capture, folder.run, config.model_copy(update={"threads": threads}))
@@ -101,10 +103,10 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
             now = time.monotonic()
             if report.evaluation:
                 held_out = {"held_out_psnr": report.evaluation.psnr, "held_out_ssim_3dgs": report.evaluation.ssim_3dgs}
-            events = list(report.events)
             # Events are reported at once: a reader should not have to wait to learn that training went back.
-            if events or now - reported >= REPORT_EVERY_S or report.evaluation or report.iteration == report.iterations:
-                progress.write({**_values(report), **held_out, "events": events, "attempt": attempt})
+            last = report.iteration == report.iterations
+            if report.events or report.evaluation or last or now - reported >= REPORT_EVERY_S:
+                progress.write(ProgressReport(**_values(report), **held_out, attempt=attempt))
                 reported = now
             if now - logged >= LOG_EVERY_S or report.evaluation or report.events:
                 _log(_line(report))
@@ -114,8 +116,16 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
                 _log(f"stopped at iteration {report.iteration}, checkpoint {path.name}")
                 return ExitCode.STOPPED
     except DivergedError as error:
-        ending = {"iteration": run.iteration, "iterations": run.iterations, "attempt": attempt}
-        progress.write({"phase": "diverged", **ending, **held_out, "events": [str(error)]})
+        progress.write(
+            ProgressReport(
+                phase="diverged",
+                iteration=run.iteration,
+                iterations=run.iterations,
+                attempt=attempt,
+                events=(Diverged(iteration=run.iteration, reason=str(error)),),
+                **held_out,
+            )
+        )
         raise
     _report(folder)
     _log("finished")
@@ -146,6 +156,7 @@ def _values(report: RunReport) -> dict[str, Any]:
         "iterations_per_s": speed,
         "eta_s": (report.iterations - report.iteration) / speed if speed > 0 else None,
         "train_s": report.train_s,
+        "events": report.events,
     }
 
 
@@ -156,7 +167,7 @@ def _line(report: RunReport) -> str:
     )
     if report.evaluation:
         line += f"; held-out PSNR {report.evaluation.psnr:.2f} dB"
-    return "; ".join([line, *report.events])
+    return "; ".join([line, *(event.message for event in report.events)])
 
 
 def _log(text: str) -> None:

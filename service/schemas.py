@@ -1,71 +1,53 @@
-"""Schemas: what the service says about jobs. Knows nothing of how it is found out."""
+"""Schemas: the resources of the service."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
 from typing import Any
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from jobs.job import Job, JobState
-
-
-class ProgressResource(BaseModel):
-    """The trainer's last report."""
-
-    phase: str = Field(description="loading, warmup, joint, static or diverged.")
-    iteration: int
-    iterations: int
-    attempt: int
-    loss: float | None = None
-    psnr: float | None = Field(None, description="Mean of the training views of the last step, in dB.")
-    gaussians: int | None = Field(None, description="Gaussians drawn in any view of the last step.")
-    anchors: int | None = None
-    iterations_per_s: float | None = None
-    eta_s: float | None = Field(None, description="Seconds of training left at this speed.")
-    train_s: float | None = Field(None, description="Seconds trained so far, evaluations not counted.")
-    held_out_psnr: float | None = Field(None, description="Of the last evaluation of this attempt, in dB.")
-    held_out_ssim_3dgs: float | None = None
-    events: list[str] = Field([], description="What happened in this step: growth, skipped steps, going back.")
+from jobs.progress import ProgressReport
 
 
 class JobResource(BaseModel):
     """A training job."""
 
-    id: str
-    name: str
-    state: JobState
+    id: str = Field(description="Identifies the job in all addresses.")
+    name: str = Field(description="Name given by its author.")
+    state: JobState = Field(description="Where the job is in its life.")
     priority: int = Field(description="Jobs with a lower number start first.")
-    created_at: datetime
-    started_at: datetime | None
-    finished_at: datetime | None
+    created_at: datetime = Field(description="When it was submitted.")
+    started_at: datetime | None = Field(description="When its trainer was first started; null before.")
+    finished_at: datetime | None = Field(description="When it ended; null before.")
     attempts: int = Field(description="How often the trainer was started.")
-    progress: ProgressResource | None
-    checkpoint: int | None = Field(description="Iteration of the newest checkpoint: what would be rendered.")
-    error: str | None
+    progress: ProgressReport | None = Field(description="The trainer's last report; null before the first.")
+    checkpoint: int | None = Field(description="Iteration of the newest checkpoint, which `/render` shows.")
+    error: str | None = Field(description="Why the job failed or diverged, with a remedy; null otherwise.")
     capture: str = Field(description="sha256 of the uploaded archive.")
-    config: dict[str, Any]
-    links: dict[str, str]
+    config: dict[str, Any] = Field(description="All options of the run; `GET /options` has their schema.")
+    links: dict[str, str] = Field(description="Addresses of what can be done with the job or read of it now.")
 
 
 class JobPage(BaseModel):
     """Some jobs, newest first."""
 
-    jobs: list[JobResource]
+    jobs: list[JobResource] = Field(description="The jobs of this page.")
     next: str | None = Field(description="Address of the next page; null on the last.")
 
 
 class Readiness(BaseModel):
     """Whether the service can take work."""
 
-    ready: bool
-    workers: int = Field(description="Workers alive. None is needed to take jobs; one is needed to do them.")
+    ready: bool = Field(description="Whether a job can be submitted.")
+    workers: int = Field(description="Live workers. Jobs can be submitted without one, but wait for one.")
     waiting: int = Field(description="Jobs that wait for a worker.")
-    free_mb: int = Field(description="Free space in the data folder.")
+    free_mb: int = Field(description="Free space in the data folder, in MB.")
 
 
 def job_resource(job: Job) -> JobResource:
-    """A job as the service shows it."""
+    """The resource of a job."""
     base = f"/jobs/{job.id}"
     links = {"self": base, "events": f"{base}/events", "log": f"{base}/log"}
     if job.state in (JobState.QUEUED, JobState.RUNNING):
@@ -89,21 +71,13 @@ def job_resource(job: Job) -> JobResource:
         started_at=None if job.started_at is None else _moment(job.started_at),
         finished_at=None if job.finished_at is None else _moment(job.finished_at),
         attempts=job.attempts,
-        progress=None if job.progress is None else _progress(job.progress),
+        progress=job.progress,
         checkpoint=job.checkpoint,
         error=job.error,
         capture=job.spec.capture,
         config=job.spec.config,
         links=links,
     )
-
-
-def _progress(report: dict[str, Any]) -> ProgressResource | None:
-    """A report as a resource; None for a line that lacks what every report has, until the next one comes."""
-    try:
-        return ProgressResource.model_validate(report)
-    except ValidationError:
-        return None
 
 
 def _moment(seconds: float) -> datetime:

@@ -13,6 +13,7 @@ PACKAGES = ("graings", "jobs", "service")
 GROUND = (
     "graings",
     "graings.constants",
+    "graings.document",
     "graings.errors",
     "graings.gaussians",
     "graings.image_encoding",
@@ -55,18 +56,18 @@ LAYERS: dict[str, tuple[str, ...]] = {
         ),
         *("graings.raster", "graings.render", "graings.report", "graings.scene", "graings.storage"),
     ),
-    "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.training"),
+    "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
         *("graings.kernel", "graings.render", "graings.report", "graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
-    "jobs": ("graings.config", "graings.storage.run_folder"),
+    "jobs": ("graings.config", "graings.report.events", "graings.storage.run_folder"),
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
     # HTTP never trains.
     "service": (
-        *("graings.camera", "graings.capture", "graings.config", "graings.kernel", "graings.render", "graings.storage"),
-        "jobs",
+        *("graings.camera", "graings.capture", "graings.config", "graings.kernel", "graings.render", "graings.report"),
+        *("graings.storage", "jobs"),
     ),
 }
 

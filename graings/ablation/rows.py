@@ -1,7 +1,7 @@
 """Rows: the models an ablation compares, what each changes, and what the paper measured for it.
 
-A row is the method with one decision taken back. Every row states all switches, so that two rows of one experiment
-differ in what their names say and in nothing else. Knows nothing of runs, folders or tables.
+A row is the method with one design decision undone. Every row sets all switches, so that two rows differ only in what
+their names say.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SCENES: Final = "mean over the eight D-NeRF scenes, 30 000 iterations"
 
 @dataclass(frozen=True, slots=True)
 class PaperResult:
-    """What the paper prints for a row: PSNR in dB, SSIM and LPIPS of the mean over D-NeRF, and in which table."""
+    """What the paper reports for a row: PSNR in dB, SSIM and LPIPS of the mean over D-NeRF, and in which table."""
 
     psnr: float
     ssim: float
@@ -48,8 +48,8 @@ PAPER_FULL: Final = PaperResult(36.982, 0.9871, 0.0136, "ablation_stopgrad")
 class Row:
     """One model of the comparison.
 
-    `changes` are the switches it takes back, by dotted option name; `needs` are options that must exceed these numbers
-    for the row to differ from the full model at all; `paper` is None where the paper has no number.
+    `changes` are the options in which it differs from the method, by dotted name; `needs` are options that must exceed
+    these numbers for the row to differ from the full model at all; `paper` is None where the paper has no number.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Row:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Every switch with the value that this row demands."""
+        """Every switch with its value in this row."""
         return {**METHOD, **self.changes}
 
 
@@ -130,18 +130,18 @@ def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
 
 
 def row_config(row: Row, preset: str, settings: Mapping[str, Any], seed: int) -> TrainConfig:
-    """The options of one run: `preset`, then the user's `settings` (dotted or nested), then what `row` demands.
+    """The options of one run: `preset`, then the user's `settings` (dotted or nested), then those of `row`.
 
     Raises `ConfigError` for settings that contradict the row, or that leave it no different from the full model.
     """
     same = nothing_to_compare(row, preset, settings)
     if same is not None:
-        raise ConfigError(f"{same} Give it more, or leave the row out (--rows).")
-    asked = make_config(preset, dict(settings))
-    if "seed" in asked.model_fields_set:
+        raise ConfigError(f"{same} Raise it, or leave the row out (--rows).")
+    config = make_config(preset, dict(settings))
+    if "seed" in config.model_fields_set:
         raise ConfigError("seed: an ablation gives every row the same seeds. Leave it out and use --seeds.")
     for key, wanted in row.options.items():
-        value, by_user = _option(asked, key)
+        value, by_user = _option(config, key)
         if by_user and value != wanted:
             raise ConfigError(
                 f"{key}: is set to {value!r}, but the row {row.name} is {wanted!r} there. "
@@ -151,16 +151,16 @@ def row_config(row: Row, preset: str, settings: Mapping[str, Any], seed: int) ->
 
 
 def nothing_to_compare(row: Row, preset: str, settings: Mapping[str, Any]) -> str | None:
-    """Why the row would be the full model under these options; None where it differs."""
-    asked = make_config(preset, dict(settings))
+    """Why the row would equal the full model under these options; None where it differs."""
+    config = make_config(preset, dict(settings))
     for key, number in row.needs.items():
-        if _option(asked, key)[0] <= number:
-            return f"{key}: is {number}, so the row {row.name} would be the full model over again."
+        if _option(config, key)[0] <= number:
+            return f"{key}: is {number}, so the row {row.name} would equal the full model."
     return None
 
 
 def combined(row: Row, preset: str, settings: Mapping[str, Any], seed: int) -> TrainConfig:
-    """As `row_config`, without asking whether the settings suit the row."""
+    """As `row_config`, without the checks."""
     return make_config(preset, {**settings, **row.options, "seed": seed})
 
 

@@ -1,7 +1,6 @@
-"""Table: the numbers of an ablation as one document, and that document as a page of markdown.
+"""Table: the numbers of an ablation as one document, and that document as a page of Markdown.
 
-Differences are to the full model of the same seed, so that what a seed does to both cancels. Knows nothing of how runs
-are made; it is told their metrics documents.
+Differences are to the full model of the same seed, so that the effect of the seed on both cancels.
 """
 
 from __future__ import annotations
@@ -9,121 +8,211 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, Final
+from typing import Any, Final, Literal
+
+from pydantic import Field
 
 from graings.ablation.rows import FULL, SCENES, PaperResult, Row
+from graings.document import Document
+from graings.report.metrics_document import Count, Metrics, Seconds
 
-SCHEMA: Final = "graings.ablation/1"
+TABLE_FILE: Final = "ablation.json"
 MINUS: Final = "\N{MINUS SIGN}"
-NOTHING: Final = "\N{EN DASH}"
+PLUS_MINUS: Final = "\N{PLUS-MINUS SIGN}"
+EMPTY: Final = "\N{EN DASH}"
 
-# Metrics documents of one row by seed; None where a run is not finished.
-Runs = Mapping[int, Mapping[str, Any] | None]
+# Metrics of one row by seed; None where a run is not finished.
+Runs = Mapping[int, Metrics | None]
 
 
-def document(facts: Mapping[str, Any], rows: Sequence[tuple[Row, Runs]]) -> dict[str, Any]:
-    """The table as plain values for strict JSON: `facts`, and for each row its runs, their means and the paper's.
+class AblationCapture(Document):
+    """The capture of an ablation."""
 
-    PSNR and differences are in dB, times in seconds. What is not measured yet is null.
-    """
+    name: str = Field(description="Name of its folder.")
+    hash: str = Field(description="Hash of its content.")
+    views: int = Field(gt=0, description="Validation views.")
+    width: int = Field(gt=0, description="Width of a view in px.")
+    height: int = Field(gt=0, description="Height of a view in px.")
+
+
+class AblationCell(Document):
+    """One run: null where it is not finished."""
+
+    seed: int = Field(description="Seed of the run.")
+    folder: str = Field(description="Folder of the run, relative to the table.")
+    finished: bool = Field(description="Whether the run has ended.")
+    psnr: float | None = Field(description="Mean PSNR on the validation views, in dB.")
+    ssim_3dgs: float | None = Field(description="Mean SSIM on the validation views.")
+    lpips_vgg: float | None = Field(description="Mean LPIPS on the validation views; null where it was not measured.")
+    difference: float | None = Field(description="`psnr` minus that of the full model of the same seed, in dB.")
+    gaussians: Count | None = Field(description="Gaussians drawn in the last step.")
+    anchors: Count | None = Field(description="Anchors of the scene.")
+    train_s: Seconds | None = Field(description="Seconds of training.")
+
+
+class Spread(Document):
+    """Mean and spread of a number over the finished runs of a row."""
+
+    mean: float | None = Field(description="Mean; null without a finished run.")
+    deviation: float | None = Field(description="Sample standard deviation; null with fewer than two runs.")
+    runs: Count = Field(description="Runs that have the number.")
+
+
+class PaperNumbers(Document):
+    """What the paper reports for a row: mean over the D-NeRF scenes."""
+
+    psnr: float = Field(description="PSNR in dB.")
+    ssim: float = Field(description="SSIM.")
+    lpips: float = Field(description="LPIPS.")
+    table: str = Field(description="Label of the table in the paper's source.")
+    difference: float = Field(description="`psnr` minus that of the paper's full model, in dB.")
+
+
+class AblationRow(Document):
+    """One model of the comparison."""
+
+    name: str = Field(description="Name of the row, as `--rows` takes it.")
+    label: str = Field(description="Name of the row for people.")
+    changes: dict[str, Any] = Field(description="Options, by dotted name, in which it differs from the full model.")
+    runs: tuple[AblationCell, ...] = Field(description="One run per seed.")
+    finished: Count = Field(description="How many of the runs have ended.")
+    psnr: Spread = Field(description="PSNR in dB.")
+    ssim_3dgs: Spread = Field(description="SSIM.")
+    difference: Spread = Field(description="Difference to the full model, in dB.")
+    gaussians: Spread = Field(description="Gaussians drawn in the last step.")
+    train_s: Spread = Field(description="Seconds of training.")
+    paper: PaperNumbers | None = Field(description="Null where the paper has no number.")
+
+
+class PaperSource(Document):
+    """Where the paper's numbers are from."""
+
+    source: str = Field(description="Tables and data of the paper's numbers.")
+
+
+class AblationTable(Document):
+    """The runs of one ablation, their means, and the paper's numbers."""
+
+    schema_name: Literal["graings.ablation/1"] = Field(
+        "graings.ablation/1", alias="schema", description="Kind and version of this document."
+    )
+    split: Literal["val"] = Field("val", description="Views that were measured.")
+    capture: AblationCapture = Field(description="The capture.")
+    options: dict[str, Any] = Field(description="Options of the full model, without seed and threads.")
+    changed_options: dict[str, Any] = Field(description="Those that are not the preset's, by dotted name.")
+    seeds: tuple[int, ...] = Field(description="Seeds of every row.")
+    rows: tuple[AblationRow, ...] = Field(description="The rows, the full model first.")
+    paper: PaperSource = Field(description="Where the paper's numbers are from.")
+    commits: tuple[str, ...] = Field(description="Commits of the code that trained the runs.")
+    machines: tuple[str, ...] = Field(description="Processors that trained the runs.")
+
+
+def make_table(
+    capture: AblationCapture,
+    options: Mapping[str, Any],
+    changed_options: Mapping[str, Any],
+    seeds: Sequence[int],
+    rows: Sequence[tuple[Row, Runs]],
+) -> AblationTable:
+    """The table of `rows`, each with the metrics of its runs."""
     full = next((runs for row, runs in rows if row.name == FULL), {})
-    return {
-        "schema": SCHEMA,
-        "split": "val",
-        **facts,
-        "rows": [_row(row, runs, full) for row, runs in rows],
-        "paper": {"source": f"GrainGS, tables of the ablation study: {SCENES}"},
-        "commits": sorted({str(m["versions"]["commit"]) for _, runs in rows for m in runs.values() if m}),
-        "machines": sorted({str(m["machine"]["cpu"]) for _, runs in rows for m in runs.values() if m}),
-    }
+    finished = [metrics for _, runs in rows for metrics in runs.values() if metrics is not None]
+    return AblationTable(
+        capture=capture,
+        options=dict(options),
+        changed_options=dict(changed_options),
+        seeds=tuple(seeds),
+        rows=tuple(_row(row, runs, full) for row, runs in rows),
+        paper=PaperSource(source=f"GrainGS, tables of the ablation study: {SCENES}"),
+        commits=tuple(sorted({str(metrics.versions.commit) for metrics in finished})),
+        machines=tuple(sorted({metrics.machine.cpu for metrics in finished})),
+    )
 
 
-def _row(row: Row, runs: Runs, full: Runs) -> dict[str, Any]:
-    cells = [_run(row, seed, numbers, full.get(seed)) for seed, numbers in runs.items()]
-    return {
-        "name": row.name,
-        "label": row.label,
-        "changes": dict(row.changes),
-        "runs": cells,
-        "finished": sum(cell["finished"] for cell in cells),
-        "psnr": _spread(cells, "psnr"),
-        "ssim_3dgs": _spread(cells, "ssim_3dgs"),
-        "difference": _spread(cells, "difference"),
-        "gaussians": _spread(cells, "gaussians"),
-        "train_s": _spread(cells, "train_s"),
-        "paper": _paper(row.paper),
-    }
+def _row(row: Row, runs: Runs, full: Runs) -> AblationRow:
+    cells = tuple(_cell(row, seed, metrics, full.get(seed)) for seed, metrics in runs.items())
+    return AblationRow(
+        name=row.name,
+        label=row.label,
+        changes=dict(row.changes),
+        runs=cells,
+        finished=sum(cell.finished for cell in cells),
+        psnr=_spread([cell.psnr for cell in cells]),
+        ssim_3dgs=_spread([cell.ssim_3dgs for cell in cells]),
+        difference=_spread([cell.difference for cell in cells]),
+        gaussians=_spread([cell.gaussians for cell in cells]),
+        train_s=_spread([cell.train_s for cell in cells]),
+        paper=None if row.paper is None else _paper(row.paper),
+    )
 
 
-def _run(row: Row, seed: int, numbers: Mapping[str, Any] | None, full: Mapping[str, Any] | None) -> dict[str, Any]:
-    cell: dict[str, Any] = {"seed": seed, "folder": f"{row.name}/seed-{seed}", "finished": numbers is not None}
-    val = numbers["splits"]["val"] if numbers is not None else {}
-    base = full["splits"]["val"]["psnr"] if full is not None else None
-    return cell | {
-        "psnr": val.get("psnr"),
-        "ssim_3dgs": val.get("ssim_3dgs"),
-        "lpips_vgg": val.get("lpips_vgg"),
-        "difference": val["psnr"] - base if val and base is not None else None,
-        **{key: numbers[key] if numbers is not None else None for key in ("gaussians", "anchors", "train_s")},
-    }
+def _cell(row: Row, seed: int, metrics: Metrics | None, full: Metrics | None) -> AblationCell:
+    val = None if metrics is None else metrics.splits["val"]
+    psnr = None if val is None else val.psnr
+    full_psnr = None if full is None else full.splits["val"].psnr
+    return AblationCell(
+        seed=seed,
+        folder=f"{row.name}/seed-{seed}",
+        finished=metrics is not None,
+        psnr=psnr,
+        ssim_3dgs=None if val is None else val.ssim_3dgs,
+        lpips_vgg=None if val is None else val.lpips_vgg,
+        difference=None if psnr is None or full_psnr is None else psnr - full_psnr,
+        gaussians=None if metrics is None else metrics.gaussians,
+        anchors=None if metrics is None else metrics.anchors,
+        train_s=None if metrics is None else metrics.train_s,
+    )
 
 
-def _spread(cells: Sequence[Mapping[str, Any]], key: str) -> dict[str, Any]:
-    """Mean over the runs that have the number, and its sample standard deviation where there are two or more."""
-    values = [float(cell[key]) for cell in cells if cell[key] is not None]
-    return {
-        "mean": math.fsum(values) / len(values) if values else None,
-        "deviation": statistics.stdev(values) if len(values) > 1 else None,
-        "runs": len(values),
-    }
+def _spread(cells: Sequence[float | None]) -> Spread:
+    values = [float(value) for value in cells if value is not None]
+    return Spread(
+        mean=math.fsum(values) / len(values) if values else None,
+        deviation=statistics.stdev(values) if len(values) > 1 else None,
+        runs=len(values),
+    )
 
 
-def _paper(result: PaperResult | None) -> dict[str, Any] | None:
-    return None if result is None else {**asdict(result), "difference": result.difference}
+def _paper(result: PaperResult) -> PaperNumbers:
+    return PaperNumbers(
+        psnr=result.psnr, ssim=result.ssim, lpips=result.lpips, table=result.table, difference=result.difference
+    )
 
 
-def markdown(table: Mapping[str, Any]) -> str:
+def markdown(table: AblationTable) -> str:
     """The document as a page: what was run, the table, and how to read it."""
-    capture, options = table["capture"], table["options"]
-    changed = "".join(f" `{key}={value}`" for key, value in table["changed_options"].items())
+    capture, options = table.capture, table.options
+    changed = "".join(f" `{key}={value}`" for key, value in table.changed_options.items())
     lines = [
-        f"# Ablation on {capture['name']}",
+        f"# Ablation on {capture.name}",
         "",
-        f"{capture['views']} validation views of {capture['width']} x {capture['height']}, preset "
-        f"`{options['preset']}`{changed} ({options['iterations']:,} iterations), seeds {_list(table['seeds'])}. "
-        f"Commit {_list(table['commits'])}; {_list(table['machines'])}.",
+        f"{capture.views} validation views of {capture.width} x {capture.height}, preset "
+        f"`{options['preset']}`{changed} ({options['iterations']:,} iterations), seeds {_list(table.seeds)}. "
+        f"Commit {_list(table.commits)}; {_list(table.machines)}.",
         "",
         "| row | runs | PSNR, dB | SSIM | to full, dB | paper to full, dB | Gaussians | train, min |",
         "|---|---|---|---|---|---|---|---|",
-        *(_line(row, len(table["seeds"])) for row in table["rows"]),
+        *(_line(row, len(table.seeds)) for row in table.rows),
         "",
-        f"Mean {_SIGN} sample standard deviation over the seeds. A difference is to the full model of the same seed. "
-        f"The paper's numbers are of other data at another length ({table['paper']['source']}): compare signs and "
+        f"Mean {PLUS_MINUS} sample standard deviation over the seeds. A difference is to the full model of the same "
+        f"seed. The paper's numbers are of other data at another length ({table.paper.source}): compare signs and "
         "order before sizes. Deformation per anchor has no number there.",
         "",
     ]
     return "\n".join(lines)
 
 
-_SIGN: Final = "\N{PLUS-MINUS SIGN}"
-
-
-def _line(row: Mapping[str, Any], seeds: int) -> str:
-    minutes = {
-        key: value / 60 if key != "runs" and value is not None else value for key, value in row["train_s"].items()
-    }
-    full = row["name"] == FULL
-    paper = row["paper"]
+def _line(row: AblationRow, seeds: int) -> str:
+    full = row.name == FULL
     cells = [
-        row["label"],
-        f"{row['finished']} of {seeds}",
-        _number(row["psnr"], "{:.2f}"),
-        _number(row["ssim_3dgs"], "{:.4f}"),
-        NOTHING if full else _number(row["difference"], "{:+.2f}"),
-        NOTHING if paper is None or full else signed(paper["difference"]),
-        _number({**row["gaussians"], "deviation": None}, "{:,.0f}"),
-        _number({**minutes, "deviation": None}, "{:.1f}"),
+        row.label,
+        f"{row.finished} of {seeds}",
+        _number(row.psnr, "{:.2f}"),
+        _number(row.ssim_3dgs, "{:.4f}"),
+        EMPTY if full else _number(row.difference, "{:+.2f}"),
+        EMPTY if row.paper is None or full else signed(row.paper.difference),
+        EMPTY if row.gaussians.mean is None else f"{row.gaussians.mean:,.0f}",
+        EMPTY if row.train_s.mean is None else f"{row.train_s.mean / 60:.1f}",
     ]
     return f"| {' | '.join(cells)} |"
 
@@ -133,14 +222,14 @@ def signed(decibels: float) -> str:
     return f"{decibels:+.2f}".replace("-", MINUS)
 
 
-def _number(value: Mapping[str, Any], form: str) -> str:
-    if value["mean"] is None:
-        return NOTHING
-    text = form.format(value["mean"]).replace("-", MINUS)
-    if value["deviation"] is not None:
-        text += f" {_SIGN} {form.replace('+', '').format(value['deviation'])}"
+def _number(value: Spread, form: str) -> str:
+    if value.mean is None:
+        return EMPTY
+    text = form.format(value.mean).replace("-", MINUS)
+    if value.deviation is not None:
+        text += f" {PLUS_MINUS} {form.replace('+', '').format(value.deviation)}"
     return text
 
 
 def _list(values: Sequence[Any]) -> str:
-    return ", ".join(map(str, values)) or NOTHING
+    return ", ".join(map(str, values)) or EMPTY

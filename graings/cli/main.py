@@ -176,7 +176,7 @@ def evaluate(
         rgb = background_rgb(background) if background is not None else None
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--background") from error
-    say(metrics_line(split, evaluate_run(run, split, capture, rgb).to_json()))
+    say(metrics_line(split, evaluate_run(run, split, capture, rgb)))
     if rgb is None:
         say(f"Written to {run / 'metrics.json'}.")
     else:
@@ -198,10 +198,10 @@ def report(
         written = report_runs(runs, output, render=render)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="RUN") from error
-    for part in written.document["training"]:
+    for part in written.document.training:
         say(summary(part))
-        for problem in part["phases"]["problems"]:
-            say(f"{part['run']['name']}: {problem}")
+        for problem in part.phases.problems:
+            say(f"{part.run.name}: {problem}")
     for note in written.notes:
         say(note)
     say(f"Written to {written.folder}: {', '.join(written.files)}.")

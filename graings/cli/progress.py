@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
+from graings.report.metrics_document import EvaluationPoint
 from graings.training.run import RunReport
-from graings.training.training_log import EvaluationPoint
 
 
 class _TimeLeft(ProgressColumn):
@@ -77,7 +77,7 @@ class TrainingProgress:
         if step.evaluation is not None:
             self._line(_evaluation(step.evaluation))
         for event in step.events:
-            self._line(f"{step.iteration:>7,}  {event}")
+            self._line(f"{event.iteration:>7,}  {event.message}")
 
     def note(self, text: str) -> None:
         """A line above the bar."""

@@ -5,12 +5,11 @@ Knows nothing of arguments, exit codes or progress bars.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from rich.console import Console
 from rich.status import Status
 from rich.text import Text
+
+from graings.evaluation.metrics import SplitMetrics
 
 
 def say(words: str) -> None:
@@ -23,11 +22,10 @@ def waiting(words: str) -> Status:
     return Console().status(Text(words, style="dim"))
 
 
-def metrics_line(split: str, metrics: Mapping[str, Any]) -> str:
-    """The means of a split as one line; `metrics` is one of the splits of a metrics document."""
-    if metrics["psnr"] is None:
-        return f"{split}: {metrics['reason']}"
-    lpips = metrics["lpips_vgg"]
-    rest = f"LPIPS {lpips:.4f}" if lpips is not None else f"no LPIPS: {metrics['lpips_reason']}"
-    views = len(metrics["views"])
-    return f"{split}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim_3dgs']:.4f}, {views} views; {rest}"
+def metrics_line(split: str, metrics: SplitMetrics) -> str:
+    """The means of a split as one line."""
+    if metrics.psnr is None:
+        return f"{split}: {metrics.reason}"
+    lpips = metrics.lpips_vgg
+    rest = f"LPIPS {lpips:.4f}" if lpips is not None else f"no LPIPS: {metrics.lpips_reason}"
+    return f"{split}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim_3dgs:.4f}, {len(metrics.views)} views; {rest}"

@@ -22,7 +22,7 @@ from graings.cli.interrupt import Interrupt
 from graings.cli.progress import TrainingProgress
 from graings.cli.terminal import metrics_line, say, waiting
 from graings.config import PRESETS, make_config
-from graings.report.report import read_metrics
+from graings.report.metrics_document import read_metrics
 from graings.training.run import TrainingRun
 
 Threads = Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads; left out: all cores.")]
@@ -127,10 +127,10 @@ def ablate(
             ablation.write()
             say(f"Stopped with {left} runs left; nothing is lost. The same command again goes on.")
             raise typer.Exit(interrupt.exit_code)
-    for row in ablation.write()["rows"]:
-        mean, difference = row["psnr"]["mean"], row["difference"]["mean"]
+    for row in ablation.write().rows:
+        mean, difference = row.psnr.mean, row.difference.mean
         if mean is not None:
-            say(f"{row['label']:>22}  {mean:.2f} dB" + (f"  {signed(difference)}" if difference is not None else ""))
+            say(f"{row.label:>22}  {mean:.2f} dB" + (f"  {signed(difference)}" if difference is not None else ""))
     say(f"The table is in {output / 'ablation.md'}, with ablation.json and ablation.svg beside it.")
 
 
@@ -156,7 +156,7 @@ def _take_steps(run: TrainingRun) -> Interrupt:
 
 
 def _say_result(run: TrainingRun) -> None:
-    for split, metrics in read_metrics(run.metrics_path)["splits"].items():
+    for split, metrics in read_metrics(run.metrics_path).splits.items():
         say(metrics_line(split, metrics))
 
 

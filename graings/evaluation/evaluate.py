@@ -1,7 +1,4 @@
-"""Evaluation: how close rendered views come to held-out images.
-
-Knows nothing of training.
-"""
+"""Evaluation: how close rendered views come to held-out images."""
 
 from __future__ import annotations
 
@@ -38,7 +35,7 @@ def evaluate(
 
 
 def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:
-    """At most `size` frames chosen by the hash of their names: fixed for a capture, spread over it."""
+    """At most `size` frames, chosen by the hash of their names: always the same, and spread over the capture."""
     if len(frames) <= size:
         return tuple(frames)
     order = sorted(range(len(frames)), key=lambda i: hashlib.sha256(frames[i].name.encode()).digest())
@@ -46,7 +43,7 @@ def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:
 
 
 def frames_per_second(scene: Scene, frames: Sequence[Frame], background: Sequence[float]) -> float:
-    """Median speed of rendering `frames` at their size after one to warm up, networks included."""
+    """Frames per second: median over `frames`, networks included, after one frame to warm up."""
     seconds = []
     for frame in (frames[0], *frames):
         started = time.perf_counter()

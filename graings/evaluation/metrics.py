@@ -2,8 +2,7 @@
 
 Every number is taken per image, on values rounded to 8 bits as a saved PNG would hold them, and then averaged
 over images. Names carry the definition, because definitions differ: the SSIM of other packages is up to 0.02
-away from `ssim_3dgs` for the same two images. Images are [H, W, 3] in [0, 1]. Knows nothing of scenes or files,
-except of where LPIPS' weights lie.
+away from `ssim_3dgs` for the same two images. Images are [H, W, 3] in [0, 1].
 """
 
 from __future__ import annotations
@@ -13,17 +12,19 @@ import math
 import os
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from graings.document import Document
 
 Image = NDArray[np.float64]
 
-# Two equal images have no error to take a logarithm of: below this mean squared error PSNR reads 100 dB.
+# Below this mean squared error PSNR is 100 dB: the logarithm of 0, the error of two equal images, is not finite.
 MSE_FLOOR: Final = 1e-10
 PSNR_CAP: Final = 100.0
 
@@ -33,46 +34,55 @@ SSIM_SIGMA: Final = 1.5
 SSIM_C1: Final = 1e-4
 SSIM_C2: Final = 9e-4
 
-# VGG halves the image five times: below this side nothing is left to compare.
+# VGG halves the image five times, which leaves no pixel of a smaller image.
 LPIPS_MIN_SIDE: Final = 32
 # torchvision names weight files after the first digits of their sha256.
 VGG_FILE: Final = "vgg16-397923af.pth"
 
 
-@dataclass(frozen=True, slots=True)
-class ViewMetrics:
-    """One image against its photograph. `time` is normalised."""
+class ViewMetrics(Document):
+    """One rendered image against its photograph."""
 
-    name: str
-    time: float
-    psnr: float  # dB, at most 100
-    ssim_3dgs: float
-    lpips_vgg: float | None
-    mse: float
+    name: str = Field(description="File name of the photograph, relative to the capture.")
+    time: float = Field(description="Normalised time of the view in [0, 1].")
+    psnr: float = Field(le=PSNR_CAP, description="Peak signal-to-noise ratio in dB; 100 for equal images.")
+    ssim_3dgs: float = Field(ge=-1, le=1, description="Structural similarity as 3D Gaussian Splatting computes it.")
+    lpips_vgg: float | None = Field(description="LPIPS distance with VGG weights; null where it was not measured.")
+    mse: float = Field(ge=0, description="Mean squared error over pixels and channels in [0, 1].")
 
 
-@dataclass(frozen=True, slots=True)
-class SplitMetrics:
-    """Means over the images of a split, each None where there is nothing to average.
+class SplitMeans(Document):
+    """Means over the views of a split."""
 
-    `lpips_reason` says why `lpips_vgg` is None, `reason` why all are; `saturated` that some image equals its
-    photograph to the last bit, so that its PSNR is the cap and not a measurement.
-    """
+    psnr: float | None = Field(le=PSNR_CAP, description="Mean over views of their PSNR in dB; null without a view.")
+    ssim_3dgs: float | None = Field(ge=-1, le=1, description="Mean over views; null without a view.")
+    lpips_vgg: float | None = Field(description="Mean over views; null where any view has none.")
+    lpips_reason: str | None = Field(description="Why `lpips_vgg` is null; null where it is not.")
+    saturated: bool = Field(
+        description="Whether some image equals its photograph to the last bit: its PSNR is then the cap of 100 dB."
+    )
+    reason: str | None = Field(None, description="Why all means are null; null where they are not.")
 
-    psnr: float | None
-    ssim_3dgs: float | None
-    lpips_vgg: float | None
-    lpips_reason: str | None
-    saturated: bool
-    views: tuple[ViewMetrics, ...]
-    reason: str | None = None
+
+class SplitMetrics(SplitMeans):
+    """Means over the views of a split, and every view."""
+
+    views: tuple[ViewMetrics, ...] = Field(description="The views, in the order of the split.")
 
     @staticmethod
     def over(views: Sequence[ViewMetrics], lpips_reason: str | None = None) -> SplitMetrics:
-        """Averages `views`; `lpips_reason` is that of the `Lpips` that measured them."""
+        """Average `views`; `lpips_reason` is that of the `Lpips` that measured them."""
         if not views:
             reason = "the split has no images"
-            return SplitMetrics(None, None, None, reason, False, (), reason)
+            return SplitMetrics(
+                psnr=None,
+                ssim_3dgs=None,
+                lpips_vgg=None,
+                lpips_reason=reason,
+                saturated=False,
+                reason=reason,
+                views=(),
+            )
         lpips = [view.lpips_vgg for view in views if view.lpips_vgg is not None]
         complete = len(lpips) == len(views)
         if not complete and lpips_reason is None:
@@ -86,15 +96,11 @@ class SplitMetrics:
             views=tuple(views),
         )
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values for strict JSON."""
-        return asdict(self)
-
 
 def measure_split(pairs: Iterable[tuple[str, float, ArrayLike, ArrayLike]], lpips: Lpips | None = None) -> SplitMetrics:
     """Metrics of a split from its (name, time, image, photograph), one pair in memory at a time."""
     views = tuple(measure(name, time, image, target, lpips) for name, time, image, target in pairs)
-    reason = "LPIPS was not asked for" if lpips is None else lpips.reason
+    reason = "LPIPS was not requested" if lpips is None else lpips.reason
     return SplitMetrics.over(views, reason)
 
 
@@ -103,7 +109,14 @@ def measure(name: str, time: float, image: ArrayLike, target: ArrayLike, lpips: 
     image_, target_ = _pair(image, target)
     error = _mse(image_, target_)
     distance = lpips(image_, target_) if lpips is not None else None
-    return ViewMetrics(name, float(time), _psnr_of(error), _ssim(image_, target_), distance, error)
+    return ViewMetrics(
+        name=name,
+        time=float(time),
+        psnr=_psnr_of(error),
+        ssim_3dgs=_ssim(image_, target_),
+        lpips_vgg=distance,
+        mse=error,
+    )
 
 
 def psnr(image: ArrayLike, target: ArrayLike) -> float:
@@ -123,7 +136,7 @@ def ssim_3dgs(image: ArrayLike, target: ArrayLike) -> float:
 class Lpips:
     """Learned perceptual distance with VGG weights (Zhang et al. 2018), if they are on this machine.
 
-    `reason` says what is missing, and then every distance is None. Nothing is ever downloaded.
+    `reason` names what is missing; every distance is None then. Nothing is ever downloaded.
     """
 
     def __init__(self, network: torch.nn.Module | None, reason: str | None) -> None:
@@ -138,7 +151,7 @@ class Lpips:
         except ModuleNotFoundError:
             return Lpips(None, "the package lpips is not installed (pip install 'graings[lpips]')")
         except (ImportError, RuntimeError) as error:
-            # A torchvision built for another torch fails like this; LPIPS is optional, the run is not.
+            # A torchvision built for another torch raises these; a run must not fail for an optional metric.
             return Lpips(None, f"the package lpips does not load: {error}")
         problem = _backbone_problem(Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE)
         if problem is not None:

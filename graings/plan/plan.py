@@ -1,39 +1,44 @@
-"""Plan: what this scene does not need, each with its reason.
+"""Plan: which components this scene does not need, each with its reason.
 
-Only decisions that lose nothing are taken by themselves here: what is left out could not have changed the
-reachable pictures. Knows nothing of how the parts work.
+A component is left out only where it could not have changed the images that the model can produce.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Literal
+
+from pydantic import Field
 
 from graings.capture.capture import Capture
 from graings.config import TrainConfig
+from graings.document import Document
 
-SCHEMA = "graings.plan/1"
 NO_ALPHA = "the images have no alpha channel"
 
-
-@dataclass(frozen=True, slots=True)
-class Decision:
-    """One component and what becomes of it. `kind` says why that is safe: the same function (exact), a
-    function the rest can represent (representable), or the user's word (user)."""
-
-    component: str
-    decision: Literal["keep", "drop"]
-    kind: Literal["exact", "representable", "user"]
-    reason: str
+Component = Literal["deformation", "residual", "temporal_loss", "rigidity", "alpha_loss", "random_points", "carving"]
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Decision(Document):
+    """One component and what becomes of it."""
+
+    component: Component = Field(description="Part of the model, the loss or the initialisation.")
+    decision: Literal["keep", "drop"] = Field(description="Whether the component is used.")
+    kind: Literal["exact", "representable", "user"] = Field(
+        description="Why dropping it is safe. exact: it would compute the same; representable: the other components "
+        "can represent its effect; user: an option asks for it."
+    )
+    reason: str = Field(description="The reason in plain words.")
+
+
+class Plan(Document):
     """The decisions for one capture and configuration."""
 
-    decisions: tuple[Decision, ...]
+    schema_name: Literal["graings.plan/1"] = Field(
+        "graings.plan/1", alias="schema", description="Kind and version of this document."
+    )
+    decisions: tuple[Decision, ...] = Field(description="One decision per component.")
 
-    def drops(self, component: str) -> bool:
+    def drops(self, component: Component) -> bool:
         """Whether `component` is left out."""
         return any(d.component == component and d.decision == "drop" for d in self.decisions)
 
@@ -55,50 +60,47 @@ class Plan:
             update={"scene": config.scene.model_copy(update=scene), "loss": config.loss.model_copy(update=loss)}
         )
 
-    def to_json(self) -> dict[str, Any]:
-        """The plan as a JSON document."""
-        return {"schema": SCHEMA, "decisions": [asdict(decision) for decision in self.decisions]}
-
 
 def make_plan(capture: Capture, config: TrainConfig) -> Plan:
     """Decide what to leave out for `capture`."""
-    instants = len(capture.times)
-    decisions = []
+    decisions: list[Decision] = []
 
     def decide(
-        component: str, drop: bool, reason: str, kind: Literal["exact", "representable"] = "representable"
+        component: Component, drop: bool, reason: str, kind: Literal["exact", "representable"] = "representable"
     ) -> None:
-        decisions.append(Decision(component, "drop" if drop else "keep", kind, reason))
+        decisions.append(Decision(component=component, decision="drop" if drop else "keep", kind=kind, reason=reason))
 
+    def dropped_by_user(component: Component, reason: str) -> None:
+        decisions.append(Decision(component=component, decision="drop", kind="user", reason=reason))
+
+    instants = len(capture.times)
     single = instants == 1
-    noun = "1 distinct training time" if single else f"{instants} distinct training times"
+    count = "1 distinct training time" if single else f"{instants} distinct training times"
     if config.scene.deformation == "none":
-        decisions.append(Decision("deformation", "drop", "user", "scene.deformation is none"))
+        dropped_by_user("deformation", "scene.deformation is none")
     else:
-        decide(
-            "deformation", single, f"{noun}: {'the canonical state is the only state' if single else 'things may move'}"
-        )
+        reason = "the canonical state is the only state" if single else "objects may move"
+        decide("deformation", single, f"{count}: {reason}")
     if not config.scene.residual:
-        decisions.append(Decision("residual", "drop", "user", "scene.residual is off"))
+        dropped_by_user("residual", "scene.residual is off")
     else:
-        decide(
-            "residual", single, f"{noun}: {'the canonical colour can be any colour' if single else 'light may change'}"
-        )
+        reason = "the canonical colour can be any colour" if single else "the light may change"
+        decide("residual", single, f"{count}: {reason}")
     static = single or config.scene.deformation == "none"
-    decide("temporal_loss", static, "no pair of times" if static else f"{noun}", "exact")
-    alone = config.batch == 1 or len(capture.train) == 1
+    decide("temporal_loss", static, "no pair of times" if static else count, "exact")
+    one_view = config.batch == 1 or len(capture.train) == 1
     if config.loss.rigidity == 0:
-        decisions.append(Decision("rigidity", "drop", "user", "loss.rigidity is 0"))
+        dropped_by_user("rigidity", "loss.rigidity is 0")
     else:
-        reason = "nothing moves" if static else "one view a step" if alone else "neighbours move together"
-        decide("rigidity", static or alone, reason, "exact")
+        reason = "nothing moves" if static else "one view per step" if one_view else "neighbours move together"
+        decide("rigidity", static or one_view, reason, "exact")
     if config.loss.alpha == 0:
-        decisions.append(Decision("alpha_loss", "drop", "user", "loss.alpha is 0"))
+        dropped_by_user("alpha_loss", "loss.alpha is 0")
     else:
-        masks = "the masks say what is solid" if capture.has_alpha else NO_ALPHA
-        decide("alpha_loss", not capture.has_alpha, masks, "exact")
+        reason = "the masks show what is opaque" if capture.has_alpha else NO_ALPHA
+        decide("alpha_loss", not capture.has_alpha, reason, "exact")
     cloud = capture.points is not None
-    decide("random_points", cloud, "the capture brings its own points" if cloud else "no point cloud in the capture")
-    where = "masks say where there is nothing" if capture.has_alpha else "nothing is where the background is seen"
-    decide("carving", cloud, "no random points" if cloud else where, "exact")
-    return Plan(tuple(decisions))
+    decide("random_points", cloud, "the capture has a point cloud" if cloud else "the capture has no point cloud")
+    empty = "the masks show empty space" if capture.has_alpha else "background pixels show empty space"
+    decide("carving", cloud, "no random points" if cloud else empty, "exact")
+    return Plan(decisions=tuple(decisions))

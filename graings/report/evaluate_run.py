@@ -1,4 +1,4 @@
-"""evaluate_run: a finished run on held-out views, written into its metrics document."""
+"""evaluate_run: metrics of a finished run on held-out views, added to its metrics document."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from graings.capture.load import load_capture
 from graings.errors import CheckpointError
 from graings.evaluation.evaluate import evaluate
 from graings.evaluation.metrics import Lpips, SplitMetrics
-from graings.report.report import read_metrics, write_metrics
+from graings.report.metrics_document import METRICS_FILE, read_metrics
+from graings.report.run_record import read_record
 from graings.storage.compact import open_model
-from graings.storage.run_folder import read_record
+from graings.storage.files import write_document
 
 
 def evaluate_run(
@@ -21,26 +22,24 @@ def evaluate_run(
 ) -> SplitMetrics:
     """Evaluate the newest model of a run on one split and write the result into its `metrics.json`.
 
-    The capture is found where it was at training time unless given. On another `background` [3] than training's,
-    which says whether opaque things are so and empty space is empty, nothing is written. Raises `CheckpointError` when
-    the run has no model or the capture is not the one it was trained on.
+    The capture is read from where it was during training unless `capture` names another place. With a `background` [3]
+    other than that of training nothing is written: such metrics only tell whether opaque objects are opaque and empty
+    space is empty. Raises `CheckpointError` when the run has no model or the capture is not the one it was trained on.
     """
     model = open_model(run)
     record = read_record(run)
-    data = load_capture(capture or record.capture, model.config.capture)
-    if data.content_hash != record.capture_hash:
+    data = load_capture(capture or record.capture.path, model.config.capture)
+    if data.content_hash != record.capture.hash:
         raise CheckpointError(
             f"{data.root}: not the capture this run was trained on. Give the original with --capture."
         )
     frames = data.split(split)
-    behind = model.background if background is None else background
-    images = ImageStore(behind, model.config.capture.cache_mb)
-    metrics = evaluate(model.scene, frames, images, behind, lpips=Lpips.find())
+    color = model.background if background is None else background
+    images = ImageStore(color, model.config.capture.cache_mb)
+    metrics = evaluate(model.scene, frames, images, color, lpips=Lpips.find())
     if background is not None:
         return metrics
-    document = read_metrics(run / "metrics.json")
-    if not isinstance(document.get("splits"), dict):
-        raise CheckpointError(f"{run / 'metrics.json'}: has no `splits`. Finish the training run again (--resume).")
-    document["splits"][split] = metrics.to_json()
-    write_metrics(run / "metrics.json", document)
+    document = read_metrics(run / METRICS_FILE)
+    splits = {**document.splits, split: metrics}
+    write_document(run / METRICS_FILE, document.model_copy(update={"splits": splits}))
     return metrics

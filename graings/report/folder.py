@@ -1,47 +1,51 @@
-"""ReportFolder: the files of a work-precision report.
+"""Report folder: the files of a work-precision report.
 
     work_precision.json   the document, schema graings.work_precision/1
-    *.csv                 points, time_to_psnr, phases and, where models were drawn, render
-    training.svg, .png    held-out error against time, iterations and Gaussians, all runs in one picture
-    render.svg, .png      error against milliseconds of a frame, where models were drawn
+    *.csv                 points, time_to_psnr, phases and, where models were rendered, render
+    training.svg, .png    held-out error against time, iterations and Gaussians, all runs in one figure
+    render.svg, .png      error against milliseconds of a frame, where models were rendered
 
-A report that is written again replaces the one before. Knows nothing of terminals, jobs or how runs are trained.
+A report that is written again replaces the one before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
 
+from graings.config import TrainConfig
 from graings.errors import CheckpointError
+from graings.report.metrics_document import Metrics
 from graings.report.picture import missing_reason, png
 from graings.report.plots import training_svg
 from graings.report.render_plot import render_svg
 from graings.report.render_precision import BUDGET_S, render_part
-from graings.report.report import read_metrics, write_bytes, write_metrics, write_text
+from graings.report.run_record import read_record
 from graings.report.tables import tables
-from graings.report.work_precision import document, read_run, run_names, training_part
+from graings.report.work_precision import read_run, run_names, training_part
+from graings.report.work_precision_document import REPORT_FILE, TrainingPart, WorkPrecision
 from graings.storage.compact import open_model
-
-DOCUMENT: Final = "work_precision.json"
+from graings.storage.files import write_bytes, write_document, write_text
+from graings.storage.run_folder import RECORD_FILE
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
-    """What was written where, the document itself, and what had to be left out and why."""
+class WrittenReport:
+    """Names of the files in `folder`, the document, and what had to be left out and why."""
 
     folder: Path
     files: tuple[str, ...]
-    document: Mapping[str, Any]
+    document: WorkPrecision
     notes: tuple[str, ...]
 
 
-def report_runs(runs: Sequence[Path], folder: Path, *, render: bool = True, budget_s: float = BUDGET_S) -> Written:
-    """Write the report of `runs`, folders of runs or their `metrics.json`, to `folder`, pictures as SVG and PNG.
+def report_runs(
+    runs: Sequence[Path], folder: Path, *, render: bool = True, budget_s: float = BUDGET_S
+) -> WrittenReport:
+    """Write the report of `runs`, folders of runs or their `metrics.json`, to `folder`, figures as SVG and PNG.
 
-    With `render` the model of every run is drawn and timed for about `budget_s` seconds, with the threads of this
+    With `render` the model of every run is rendered and timed for about `budget_s` seconds, with the threads of this
     process. A run without a model, and PNG without matplotlib, are left out with a note. Raises `CheckpointError`
     naming a run whose metrics cannot be read, `ValueError` when one is given twice.
     """
@@ -50,48 +54,52 @@ def report_runs(runs: Sequence[Path], folder: Path, *, render: bool = True, budg
     rendered, omissions = [], []
     for name, path in zip(names, runs, strict=True):
         if not render:
-            omissions.append(f"{name}: not drawn, as asked")
+            omissions.append(f"{name}: not rendered, because rendering was switched off")
             continue
         try:
             rendered.append(render_part(name, open_model(_folder(path)), budget_s=budget_s))
         except (CheckpointError, ValueError) as error:
-            omissions.append(f"{name}: not drawn ({error})")
-    return _write(folder, document(training, rendered, omissions), pictures=True)
+            omissions.append(f"{name}: not rendered ({error})")
+    report = WorkPrecision(training=tuple(training), render=tuple(rendered), omissions=tuple(omissions))
+    return _write(folder, report, with_png=True)
 
 
-def report_training(name: str, metrics: Mapping[str, Any], run: Mapping[str, Any], folder: Path) -> Written:
-    """Write the report of a run in the middle of it: what costs milliseconds, so no model is drawn and no PNG made."""
-    omissions = [f"{name}: not drawn while it trains"]
-    return _write(folder, document([training_part(name, metrics, run)], [], omissions), pictures=False)
+def report_training(name: str, metrics: Metrics, config: TrainConfig, folder: Path) -> WrittenReport:
+    """Write the report of a run that still trains: only what takes milliseconds, so no rendering and no PNG."""
+    omission = f"{name}: not rendered while it trains"
+    training = training_part(name, metrics, config)
+    report = WorkPrecision(training=(training,), render=(), omissions=(omission,))
+    return _write(folder, report, with_png=False)
 
 
-def _training(name: str, path: Path) -> dict[str, Any]:
-    facts = _folder(path) / "run.json"
-    return training_part(name, read_run(path), read_metrics(facts) if facts.is_file() else None)
+def _training(name: str, path: Path) -> TrainingPart:
+    metrics, folder = read_run(path), _folder(path)
+    config = read_record(folder).config if (folder / RECORD_FILE).is_file() else None
+    return training_part(name, metrics, config)
 
 
 def _folder(path: Path) -> Path:
     return path.parent if path.is_file() else path
 
 
-def _write(folder: Path, report: Mapping[str, Any], *, pictures: bool) -> Written:
+def _write(folder: Path, report: WorkPrecision, *, with_png: bool) -> WrittenReport:
     folder.mkdir(parents=True, exist_ok=True)
-    drawings = {"training": training_svg(report["training"])}
-    if report["render"]:
-        drawings["render"] = render_svg(report["render"])
+    drawings = {"training": training_svg([part.model_dump(mode="json") for part in report.training])}
+    if report.render:
+        drawings["render"] = render_svg([part.model_dump(mode="json") for part in report.render])
     texts = tables(report) | {f"{name}.svg": drawing for name, drawing in drawings.items()}
-    # What only an earlier report had would contradict this one.
+    # A file that only an earlier report had would contradict this one.
     for stale in {"render.csv", "render.svg", "render.png", "training.png"} - texts.keys():
         (folder / stale).unlink(missing_ok=True)
-    write_metrics(folder / DOCUMENT, report)
+    write_document(folder / REPORT_FILE, report)
     for name, text in texts.items():
         write_text(folder / name, text)
-    files, notes = [DOCUMENT, *texts], list(report["omissions"])
-    reason = missing_reason() if pictures else None
+    files, notes = [REPORT_FILE, *texts], list(report.omissions)
+    reason = missing_reason() if with_png else None
     if reason is not None:
         notes.append(f"PNG left out: {reason}")
-    elif pictures:
+    elif with_png:
         for name, drawing in drawings.items():
             write_bytes(folder / f"{name}.png", png(drawing))
             files.append(f"{name}.png")
-    return Written(folder, tuple(files), report, tuple(notes))
+    return WrittenReport(folder, tuple(files), report, tuple(notes))

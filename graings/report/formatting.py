@@ -1,10 +1,10 @@
-"""Numbers as a reader wants to see them."""
+"""Numbers as text for people."""
 
 from __future__ import annotations
 
 
 def duration(seconds: float) -> str:
-    """Seconds for a reader."""
+    """Seconds in the unit that fits: s, min or h."""
     for length, unit in ((3600, "h"), (60, "min")):
         if seconds >= length:
             return f"{seconds / length:.3g} {unit}"
@@ -12,10 +12,10 @@ def duration(seconds: float) -> str:
 
 
 def error(value: float) -> str:
-    """A root mean squared error for a reader."""
+    """A root mean squared error with three decimals, or two digits where it is small."""
     return f"{value:.3f}" if value >= 0.01 else f"{value:.2g}"
 
 
 def count(number: float) -> str:
-    """A number of things for a reader."""
+    """A count, thousands as k."""
     return f"{number:.3g}" if number < 1000 else f"{number / 1000:.3g}k"

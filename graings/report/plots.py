@@ -160,9 +160,9 @@ def _reached(entry: Mapping[str, Any]) -> str:
     """A time, or the side on which it is known to lie."""
     if entry["train_s"] is not None:
         return duration(entry["train_s"])
-    if "censored_at_s" in entry:
+    if entry["censored_at_s"] is not None:
         return f"> {duration(entry['censored_at_s'])}"
-    return f"≤ {duration(entry['at_most_s'])}" if "at_most_s" in entry else "-"
+    return f"≤ {duration(entry['at_most_s'])}" if entry["at_most_s"] is not None else "-"
 
 
 def _seconds(part: Mapping[str, Any], y: float) -> list[str]:

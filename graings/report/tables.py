@@ -1,34 +1,14 @@
-"""Tables: the numbers of a work-precision report as CSV, one row per point.
-
-Empty where the document says null. Knows nothing of files or of how the numbers came about.
-"""
+"""Tables: the numbers of a work-precision report as CSV, one row per point; empty where the document has null."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from graings.config.schedule import TRAINING_PHASES
-from graings.report.work_precision import LATER_POINT_KEYS, POINT_KEYS
-
-_POINT_KEYS = (*POINT_KEYS, *LATER_POINT_KEYS)
-TIME_KEYS = ("target_db", "train_s", "iteration", "gaussians", "censored_at_s", "at_most_s", "reason")
-
-
-def tables(document: Mapping[str, Any]) -> dict[str, str]:
-    """CSV texts of a report by file name; `render.csv` only where something was rendered."""
-    training, render = document["training"], document["render"]
-    made = {
-        "points.csv": _csv(("run", *_POINT_KEYS), _rows(training, "points", _POINT_KEYS)),
-        "time_to_psnr.csv": _csv(("run", *TIME_KEYS), _rows(training, "time_to_psnr", TIME_KEYS)),
-        "phases.csv": _csv(("run", "phase", "seconds", "is_training"), _phases(training)),
-    }
-    if render:
-        made["render.csv"] = _csv(RENDER_COLUMNS, _render(render))
-    return made
-
+from graings.report.metrics_document import EvaluationPoint
+from graings.report.work_precision_document import RenderPart, TimeToPsnr, TrainingPart, WorkPrecision
 
 RENDER_COLUMNS = (
     *("run", "sweep", "scale", "alpha_min", "transmittance_min", "ms_median", "ms_min", "ms_iqr", "ms_networks"),
@@ -36,29 +16,44 @@ RENDER_COLUMNS = (
 )
 
 
-def _rows(parts: Sequence[Mapping[str, Any]], name: str, keys: Sequence[str]) -> Iterator[list[Any]]:
+def tables(report: WorkPrecision) -> dict[str, str]:
+    """CSV texts of a report by file name; `render.csv` only where something was rendered."""
+    texts = {
+        "points.csv": _csv(("run", *EvaluationPoint.model_fields), _points(report.training)),
+        "time_to_psnr.csv": _csv(("run", *TimeToPsnr.model_fields), _times(report.training)),
+        "phases.csv": _csv(("run", "phase", "seconds", "is_training"), _phases(report.training)),
+    }
+    if report.render:
+        texts["render.csv"] = _csv(RENDER_COLUMNS, _render(report.render))
+    return texts
+
+
+def _points(parts: Sequence[TrainingPart]) -> Iterator[list[Any]]:
     for part in parts:
-        for row in part[name]:
-            yield [part["run"]["name"], *(row.get(key) for key in keys)]
+        yield from ([part.run.name, *point.to_json().values()] for point in part.points)
 
 
-def _phases(parts: Sequence[Mapping[str, Any]]) -> Iterator[list[Any]]:
+def _times(parts: Sequence[TrainingPart]) -> Iterator[list[Any]]:
     for part in parts:
-        spent = part["phases"]
-        for phase, seconds in spent["seconds"].items():
-            yield [part["run"]["name"], phase, seconds, phase in TRAINING_PHASES]
-        yield [part["run"]["name"], "unaccounted", spent["unaccounted_s"], False]
+        yield from ([part.run.name, *entry.to_json().values()] for entry in part.time_to_psnr)
 
 
-def _render(parts: Sequence[Mapping[str, Any]]) -> Iterator[list[Any]]:
+def _phases(parts: Sequence[TrainingPart]) -> Iterator[list[Any]]:
     for part in parts:
-        for point in part["points"]:
-            setting, ms, err = point["setting"], point["ms"], point["err"]
+        times = part.phases
+        for phase, seconds in times.seconds.items():
+            yield [part.run.name, phase, seconds, phase in times.training]
+        yield [part.run.name, "unaccounted", times.unaccounted_s, False]
+
+
+def _render(parts: Sequence[RenderPart]) -> Iterator[list[Any]]:
+    for part in parts:
+        for point in part.points:
+            setting, ms, err = point.setting, point.ms, point.err
             yield [
-                *(part["run"]["name"], setting["sweep"], setting["scale"]),
-                *(setting["alpha_min"], setting["transmittance_min"]),
-                *(ms["median"], ms["min"], ms["iqr"], ms["networks"]),
-                *(err["rmse"], err["max"], err["psnr_vs_reference"], err["lsb8_changed"], point["on_front"]),
+                *(part.run.name, setting.sweep, setting.scale, setting.alpha_min, setting.transmittance_min),
+                *(ms.median, ms.min, ms.iqr, ms.networks),
+                *(err.rmse, err.max, err.psnr_vs_reference, err.lsb8_changed, point.on_front),
             ]
 
 

@@ -1,57 +1,27 @@
-"""Run folder: what a run says of itself, where its checkpoints lie, which is the newest, and who may write them.
+"""Run folder: names of its files, where its checkpoints are, which is the newest, and who may write them.
 
-Apart from `graings.storage.checkpoint`, so that reading the progress of a run loads no tensors.
+Separate from `graings.storage.checkpoint`, so that a look at the progress of a run does not import torch.
 """
 
 from __future__ import annotations
 
 import fcntl
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from graings.errors import CheckpointError
 
 RECORD_FILE = "run.json"
 LOCK_FILE = ".training"
 CHECKPOINTS = "checkpoints"
-MODEL_FILE = "model.graings"  # the model alone, small, as it is given away
+MODEL_FILE = "model.graings"  # the compact model
 BEST = "best"
 FACTS_FILE = "checkpoint.json"
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
-    """What a run says of itself: its options as they were stored, where its capture lay, and that capture's hash."""
-
-    config: Any
-    capture: Path
-    capture_hash: str
-
-
-def read_record(run: Path) -> Record:
-    """The record of a run folder. Raises `CheckpointError`."""
-    file = run / RECORD_FILE
-    try:
-        facts = json.loads(file.read_text())
-    except FileNotFoundError as error:
-        raise CheckpointError(
-            f"{run}: holds no run to resume or measure, for there is no {RECORD_FILE}. Give the folder of a run, not "
-            "that of one of its checkpoints."
-        ) from error
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{file}: not readable ({error}). Train anew.") from error
-    try:
-        return Record(facts["config"], Path(facts["capture"]["path"]), facts["capture"]["hash"])
-    except (KeyError, TypeError) as error:
-        raise CheckpointError(f"{file}: is not what a run writes there ({error!r}). Train anew.") from error
-
-
 def checkpoints(run: Path) -> list[Path]:
-    """The whole checkpoints of a run folder, oldest first."""
+    """The complete checkpoints of a run folder, oldest first."""
     folder = run / CHECKPOINTS
     if not folder.is_dir():
         return []
@@ -59,29 +29,26 @@ def checkpoints(run: Path) -> list[Path]:
 
 
 def newest_checkpoint(run: Path) -> Path | None:
-    """The newest whole checkpoint of a run folder, or None."""
-    found = checkpoints(run)
-    return found[-1] if found else None
+    """The newest complete checkpoint of a run folder, or None."""
+    complete = checkpoints(run)
+    return complete[-1] if complete else None
 
 
 def newest_model(run: Path) -> Path | None:
-    """Where the model of a run folder lies: its newest whole checkpoint, or where there is none its compact file.
-
-    None where there is neither.
-    """
+    """Where the model of a run folder is: its newest complete checkpoint, else its compact file, else None."""
     compact = run / MODEL_FILE
     return newest_checkpoint(run) or (compact if compact.is_file() else None)
 
 
 def best_checkpoint(run: Path) -> Path | None:
-    """The checkpoint of the best held-out quality so far, or None; `newest_checkpoint` never is this folder."""
+    """The checkpoint of the best held-out quality so far, or None; `newest_checkpoint` never returns this folder."""
     folder = run / CHECKPOINTS / BEST
     return folder if (folder / FACTS_FILE).is_file() else None
 
 
 @contextmanager
 def sole_trainer(run: Path) -> Iterator[None]:
-    """Holds a run folder for this trainer. Raises `CheckpointError` when another process of this machine does."""
+    """Lock a run folder for one trainer. Raises `CheckpointError` when another process of this machine has the lock."""
     with (run / LOCK_FILE).open("a") as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

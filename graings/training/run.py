@@ -13,19 +13,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 from graings.capture.background import with_background
-from graings.capture.capture import SPLITS, Capture, Frame
+from graings.capture.capture import SPLITS, Capture, Frame, Split
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
-from graings.config import TrainConfig, restored
+from graings.config import TrainConfig
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation.evaluate import evaluate, subset
 from graings.evaluation.metrics import Lpips, SplitMetrics
 from graings.kernel import use_threads
 from graings.plan.plan import Plan, make_plan
-from graings.report.report import read_metrics
+from graings.report.events import Diverged, Event, Restarted
+from graings.report.metrics_document import CompactFacts, EvaluationPoint, read_metrics
+from graings.report.run_record import read_record
 from graings.storage.checkpoint import (
     TrainingState,
     best_checkpoint,
@@ -36,13 +37,13 @@ from graings.storage.checkpoint import (
     save_checkpoint,
 )
 from graings.storage.compact import read_compact, write_compact
-from graings.storage.run_folder import MODEL_FILE, RECORD_FILE, read_record, sole_trainer
+from graings.storage.run_folder import MODEL_FILE, sole_trainer
 from graings.training.curriculum import missing_motion
 from graings.training.curriculum.restart import RestartState
 from graings.training.guard.stiffness import Stiffness, subpixel_share
 from graings.training.timing import Clock, Rate, evaluation_marks
 from graings.training.trainer import StepReport, Trainer
-from graings.training.training_log import EvaluationPoint, TrainingLog
+from graings.training.training_log import TrainingLog
 
 LOG = logging.getLogger(__name__)
 
@@ -111,11 +112,11 @@ class TrainingRun:
         run or the capture is another one.
         """
         record = read_record(folder)
-        config = restored(TrainConfig, record.config, folder / RECORD_FILE)
+        config = record.config
         clock = Clock()
         started = time.perf_counter()
-        data = load_capture(capture or record.capture, config.capture)
-        if data.content_hash != record.capture_hash:
+        data = load_capture(capture or record.capture.path, config.capture)
+        if data.content_hash != record.capture.hash:
             raise CheckpointError(f"{data.root}: not the capture this run began with. Give the original one.")
         clock.add("load", time.perf_counter() - started)
         if newest_checkpoint(folder) is None:
@@ -163,7 +164,7 @@ class TrainingRun:
             self._journal.clock.add(step.phase, step.seconds, step.cpu_s)
             self._journal.gaussians = step.gaussians
             rate.add(step.seconds)
-            self._journal.note(self.iteration, step.events)
+            self._journal.note(step.events)
             last = step.iteration == self.iterations
             saving = step.iteration % self.config.evaluation.checkpoint_every == 0
             # Nobody looks at a scene, or saves it, that is not finite.
@@ -174,8 +175,8 @@ class TrainingRun:
             if saving and not last:
                 self._save()
             if last:
-                point, said = self._finish()
-                found += said
+                point, final_events = self._finish()
+                found += final_events
             yield RunReport(
                 **({part.name: getattr(step, part.name) for part in fields(step)} | {"events": step.events + found}),
                 iterations_per_s=rate.per_second(),
@@ -195,12 +196,12 @@ class TrainingRun:
             raise
         return self._save()
 
-    def _check(self) -> tuple[str, ...]:
+    def _check(self) -> tuple[Event, ...]:
         found = tuple(self._trainer.check())
-        self._journal.note(self.iteration, found)
+        self._journal.note(found)
         return found
 
-    def _look_for_lost(self) -> tuple[str, ...]:
+    def _look_for_lost(self) -> tuple[Event, ...]:
         """Once, early enough: begin again in a part of the clip where training has lost what moves in all of it.
 
         What is lost once is not found again. The new attempt takes as many iterations as the run was to have: what
@@ -216,16 +217,13 @@ class TrainingRun:
         started, computed = time.perf_counter(), time.process_time()
         frames = subset(self.capture.train, missing_motion.VIEWS)
         share = missing_motion.missing_fraction(trainer.scene, frames, self.images, trainer.background)
-        said: tuple[str, ...] = ()
+        events: tuple[Event, ...] = ()
         if share > missing_motion.MAX_MISSING_FRACTION:
             self._begin(RestartState(self.iteration, part))
-            said = (
-                f"time_window: begins again, in the middle of the clip: in {share:.0%} of the views something large "
-                "that moves was missing_motion. `time_window=1` keeps what there is.",
-            )
-            self._journal.note(self.iteration, said)
+            events = (Restarted(iteration=self.iteration, missing_share=share, time_window=part),)
+            self._journal.note(events)
         self._journal.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
-        return said
+        return events
 
     def _save(self, *, finished: bool = False, best: bool = False, instead_of_later: bool = False) -> Path:
         started = time.perf_counter()
@@ -267,7 +265,7 @@ class TrainingRun:
         self._write_metrics({})
         return point
 
-    def _finish(self) -> tuple[EvaluationPoint | None, tuple[str, ...]]:
+    def _finish(self) -> tuple[EvaluationPoint | None, tuple[Event, ...]]:
         """Evaluate all of val, write the final checkpoint, metrics and curve; returns the last point, and events."""
         point = None
         started = time.perf_counter()
@@ -275,18 +273,18 @@ class TrainingRun:
             point = self._point(evaluate(self._trainer.scene, self._held_out(), self.images, self._trainer.background))
         stiffness = self._stiffness(self.capture.train)
         self._journal.clock.add("evaluation", time.perf_counter() - started)
-        said = stiffness.events()
-        self._journal.note(self.iteration, said)
+        events = stiffness.events(self.iteration)
+        self._journal.note(events)
         splits = self._splits()
         self._save(finished=True)
         self._write_metrics(splits, self._export(), stiffness)
-        return point, said
+        return point, events
 
     def _stiffness(self, frames: Sequence[Frame]) -> Stiffness:
         trainer = self._trainer
         return Stiffness(trainer.step_over_size, subpixel_share(trainer.scene, frames, trainer.background), len(frames))
 
-    def _export(self) -> dict[str, Any]:
+    def _export(self) -> CompactFacts:
         """Write the newest checkpoint as one small file: its name, its bytes, and the PSNR it has on all of val."""
         started = time.perf_counter()
         size = write_compact(load_model(self.folder), self.folder / MODEL_FILE)
@@ -295,9 +293,9 @@ class TrainingRun:
             scene, background = read_compact(self.folder / MODEL_FILE).scene, self._trainer.background
             psnr = evaluate(scene, self.capture.val, self.images, background).psnr
         self._journal.clock.add("evaluation", time.perf_counter() - started)
-        return {"file": MODEL_FILE, "bytes": size, "psnr": psnr}
+        return CompactFacts(file=MODEL_FILE, bytes=size, psnr=psnr)
 
-    def _splits(self) -> dict[str, Any]:
+    def _splits(self) -> dict[Split, SplitMetrics]:
         """Metrics of all of val, as a finished run reports them."""
         if not self.capture.val:
             return {}
@@ -305,7 +303,7 @@ class TrainingRun:
         trainer = self._trainer
         full = evaluate(trainer.scene, self.capture.val, self.images, trainer.background, lpips=Lpips.find())
         self._journal.clock.add("evaluation", time.perf_counter() - started)
-        return {"val": full.to_json()}
+        return {"val": full}
 
     def _deliver(self, reason: str) -> None:
         """Training has diverged: make the best model the newest checkpoint, and say so in the metrics.
@@ -313,7 +311,7 @@ class TrainingRun:
         The best is that of the last good moment or of the best evaluation, whichever held-out views like more. What
         was saved after it is dropped: nobody should find it in its place.
         """
-        self._journal.note(self.iteration, [f"diverged: {reason}"])
+        self._journal.note([Diverged(iteration=self.iteration, reason=reason)])
         self._journal.diverged = reason
         guard = self._trainer.guard
         self._trainer.restore()
@@ -333,10 +331,10 @@ class TrainingRun:
         if not self.metrics_path.exists():
             return False
         document = read_metrics(self.metrics_path)
-        return bool(document.get("iterations") == self.iterations and (document.get("splits") or not self.capture.val))
+        return document.iterations == self.iterations and bool(document.splits or not self.capture.val)
 
     def _write_metrics(
-        self, splits: dict[str, Any], compact: dict[str, Any] | None = None, stiffness: Stiffness | None = None
+        self, splits: dict[Split, SplitMetrics], compact: CompactFacts | None = None, stiffness: Stiffness | None = None
     ) -> None:
         trainer = self._trainer
         facts = (self.threads, splits, compact, stiffness)

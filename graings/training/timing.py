@@ -1,7 +1,4 @@
-"""Pace: what a run spends its seconds on, how fast it goes, and when it pauses to look at held-out views.
-
-Knows nothing of what is done in those seconds.
-"""
+"""Timing: seconds per phase of a run, its rate, and the iterations after which it is evaluated."""
 
 from __future__ import annotations
 
@@ -17,26 +14,25 @@ RATE_WINDOW_S = 5.0
 
 @dataclass(slots=True)
 class Clock:
-    """Seconds per phase; training, evaluation and saving never share a second.
+    """Seconds per phase, none counted twice.
 
-    The wall clock beside them starts with the object, after the `before_s` of earlier sittings: what nobody booked
-    shows as a difference. `train_cpu_s` is what all threads of the process computed while training, which a busy or
-    halted machine does not change much; None where an earlier version trained a part of the run and did not look.
+    The wall clock beside them starts with the object and adds the `before_s` of earlier starts of the run: time that
+    belongs to no phase shows as a difference. `train_cpu_s` is the CPU time of all threads while training, which
+    hardly depends on other load of the machine.
     """
 
     seconds: dict[str, float] = field(default_factory=dict)
     before_s: float = 0.0
-    train_cpu_s: float | None = 0.0
+    train_cpu_s: float = 0.0
     _started: float = field(default_factory=time.perf_counter)
 
     def add(self, phase: str, seconds: float, cpu_s: float = 0.0) -> None:
-        """Book `seconds` on a phase of training or on load, evaluation or checkpoint.
+        """Add `seconds` to a phase of training, or to load, evaluation, checkpoint or report.
 
-        `cpu_s` are the seconds of processors that a phase of training took.
+        `cpu_s` is the CPU time of a phase of training.
         """
         self.seconds[phase] = self.seconds.get(phase, 0.0) + seconds
-        if self.train_cpu_s is not None:
-            self.train_cpu_s += cpu_s
+        self.train_cpu_s += cpu_s
 
     def train_s(self) -> float:
         """Seconds of training alone."""
@@ -47,7 +43,7 @@ class Clock:
         return sum(self.seconds.values())
 
     def wall_s(self) -> float:
-        """Seconds on the wall, interruptions left out."""
+        """Wall-clock seconds, interruptions left out."""
         return self.before_s + time.perf_counter() - self._started
 
 
@@ -59,19 +55,19 @@ class Rate:
         self._sum = 0.0
 
     def add(self, seconds: float) -> None:
-        """One more step, and how long it took."""
+        """Add a step that took `seconds`."""
         self._recent.append(seconds)
         self._sum += seconds
         while len(self._recent) > 1 and self._sum - self._recent[0] > RATE_WINDOW_S:
             self._sum -= self._recent.pop(0)
 
     def per_second(self) -> float:
-        """Steps per second lately."""
+        """Steps per second over the last few seconds."""
         return len(self._recent) / max(self._sum, 1e-9)
 
 
 def evaluation_marks(config: TrainConfig, iterations: int) -> frozenset[int]:
-    """Which of `iterations` are evaluated: geometrically spaced."""
+    """Iterations below `iterations` after which the run is evaluated: geometrically spaced."""
     marks, mark = set(), float(config.evaluation.first)
     while mark < iterations:
         marks.add(round(mark))

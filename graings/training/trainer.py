@@ -26,6 +26,16 @@ from graings.random import RandomStreams
 from graings.raster.photometric import photometric
 from graings.raster.result import RenderResult
 from graings.render import draw, low_pass
+from graings.report.events import (
+    BackgroundFound,
+    Event,
+    GradientsClipped,
+    LowResolutionStarted,
+    OpacityReset,
+    RolledBack,
+    StepSkipped,
+    TimeWindowStarted,
+)
 from graings.scene.scene import Composition, Scene
 from graings.training import losses
 from graings.training.curriculum.image_pyramid import ImagePyramid
@@ -65,7 +75,7 @@ class StepReport:
     anchors: int
     seconds: float
     cpu_s: float
-    events: tuple[str, ...] = ()
+    events: tuple[Event, ...] = ()
 
 
 class Trainer:
@@ -108,6 +118,11 @@ class Trainer:
         while self.iteration < self.config.iterations:
             yield self.step()
 
+    @property
+    def run_iteration(self) -> int:
+        """Iterations of the run done, those of an earlier attempt included."""
+        return self.before + self.iteration
+
     def phase(self, iteration: int) -> Phase:
         """The phase that `iteration` (from 1) belongs to."""
         return next(phase for phase in self.phases if iteration <= phase.last)
@@ -147,7 +162,7 @@ class Trainer:
             loss.backward()
 
         events = self._opening()
-        names = ", ".join(frame.name for frame in frames)
+        names = tuple(frame.name for frame in frames)
         gradients = self.optimizer.gradients()
         gradients += [Gradient("the projected centres", SCREEN, o.grad) for o in offsets if o.grad is not None]
         errors = [float(functional.mse_loss(r.color.detach(), t)) for r, t in zip(results, targets, strict=True)]
@@ -155,7 +170,9 @@ class Trainer:
         verdict = self.guard.check_step(self.iteration, loss.detach() - squared * statistics.mean(errors), gradients)
         if verdict.non_finite is None:
             for group, (norm, limit) in verdict.limits.items():
-                events.append(f"clipped: gradients of {group} at {norm:.3g} limited to {limit:.3g} on {names}")
+                events.append(
+                    GradientsClipped(iteration=self.run_iteration, group=group, norm=norm, limit=limit, views=names)
+                )
                 if group != SCREEN:
                     self.optimizer.limit(group, self.config.guard.clip, limit)
             # A step out of all proportion says nothing about where anchors are wanted.
@@ -174,13 +191,19 @@ class Trainer:
                 self._measure(compositions[0], frames[0])
         else:
             self.optimizer.clear()
-            moments = ", ".join(f"{frame.time:.4g}" for frame in frames)
-            events.append(f"skipped: {verdict.non_finite} was not finite on {names} at t = {moments}")
+            events.append(
+                StepSkipped(
+                    iteration=self.run_iteration,
+                    non_finite=verdict.non_finite,
+                    views=names,
+                    times=tuple(frame.time for frame in frames),
+                )
+            )
         events += self._adapt()
         events += self._watch(len(children), float(differences.detach().amax()))
         self._settle()
         return StepReport(
-            iteration=self.before + self.iteration,
+            iteration=self.run_iteration,
             iterations=self.before + self.config.iterations,
             phase=phase.name,
             loss=float(loss.detach()),
@@ -216,18 +239,18 @@ class Trainer:
             before.gaussians, after.gaussians, frame.camera, low_pass(before, frame.camera)
         )
 
-    def _opening(self) -> list[str]:
-        """At the first step, what was decided before it; in words."""
+    def _opening(self) -> list[Event]:
+        """At the first step, what was decided before it."""
         if self.iteration > 1:
             return []
-        events = list(self.start_notes)
+        iteration = self.run_iteration
+        events: list[Event] = [note.at(iteration) for note in self.start_notes]
         if self.background != (1.0, 1.0, 1.0):
-            seen = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.background)
-            events.append(f"background: {seen}; where pictures show it there is nothing")
+            events.append(BackgroundFound(iteration=iteration, color=self.background))
         if (share := self.window.share(1)) < 1:
-            events.append(f"time_window: begins with the middle {100 * share:.3g} % of the clip and widens")
+            events.append(TimeWindowStarted(iteration=iteration, share=share))
         if (times := self.pyramid.at(1).times) > 1:
-            events.append(f"low_resolution_until: begins with pictures of 1/{times} of their width and height")
+            events.append(LowResolutionStarted(iteration=iteration, factor=times))
         return events
 
     def _look(self) -> None:
@@ -257,20 +280,20 @@ class Trainer:
         """The terms on the model itself, with this run's weights and streams."""
         return regularisers(self.scene, compositions, moments, self.times, self.config.loss, self.streams)
 
-    def _adapt(self) -> list[str]:
-        """Grow and prune where the schedule says so; returns what happened, in words."""
-        events: list[str] = []
+    def _adapt(self) -> list[Event]:
+        """Grow and prune where the schedule says so; returns what happened."""
+        events: list[Event] = []
         if self.density.grows(self.iteration):
-            born, events = self.density.grow(self.scene, self.optimizer, self.streams["growth"])
+            born, events = self.density.grow(self.run_iteration, self.scene, self.optimizer, self.streams["growth"])
             if born > 0:
                 self.guard.trend.grown()
         if self.density.prunes(self.iteration):
-            events += self.density.prune(self.scene, self.optimizer)
+            events += self.density.prune(self.run_iteration, self.scene, self.optimizer)
         return events
 
-    def _watch(self, drawn: int, difference: float) -> list[str]:
-        """Look after the scene's health and go back where it is lost; returns what happened, in words."""
-        events: list[str] = []
+    def _watch(self, drawn: int, difference: float) -> list[Event]:
+        """Roll back where training went wrong; returns what happened."""
+        events: list[Event] = []
         scaffold, every = self.scene.scaffold, self.config.guard
         problem = self.guard.problem()
         last_of_pass = not self._upcoming()
@@ -279,10 +302,7 @@ class Trainer:
             if problem is None and not self.collapse.raised:
                 shift = raise_opacity(self.scene)
                 self.collapse.raised = True
-                events.append(
-                    f"opacity_rebias: nothing was drawn any more; scores raised to {RESET_OPACITY} ({shift:+.3g}). "
-                    "Where things move far, train with a smaller `time_window`."
-                )
+                events.append(OpacityReset(iteration=self.run_iteration, opacity=RESET_OPACITY, shift=shift))
             elif problem is None and self.collapse.missed:  # where the pictures are empty, so may the scene be
                 problem = "nothing was drawn any more, though there was something to see"
         due = self.iteration % every.snapshot_every == 0
@@ -303,10 +323,10 @@ class Trainer:
             if self.iteration == self.config.iterations:
                 self.average.apply(self.scene)
 
-    def check(self) -> list[str]:
+    def check(self) -> list[Event]:
         """Make sure that the scene is finite before somebody looks at it or saves it, going back where it is not.
 
-        Returns what happened, in words. Raises `DivergedError` as `step` does.
+        Returns what happened. Raises `DivergedError` as `step` does.
         """
         problem = self._lost()
         return [] if problem is None else [self._go_back(problem)]
@@ -320,7 +340,7 @@ class Trainer:
     def _take_snapshot(self) -> None:
         self.snapshots.take(self.iteration, self.scene, *self.state())
 
-    def _go_back(self, problem: str) -> str:
+    def _go_back(self, problem: str) -> RolledBack:
         """Restore a good moment and go on more slowly and in another order of views. The iterations are spent."""
         if self.guard.rollbacks >= self.config.guard.rollbacks:
             raise DivergedError(
@@ -338,9 +358,11 @@ class Trainer:
         self.collapse.raised = raised
         self._slow_down()
         self.sampler = self._sampler()
-        return (
-            f"rolled back to iteration {self.before + snapshot.iteration}: {problem}; "
-            f"rates at {self.optimizer.damping:.3g} of their plan from here on"
+        return RolledBack(
+            iteration=self.run_iteration,
+            to_iteration=self.before + snapshot.iteration,
+            reason=problem,
+            rate_factor=self.optimizer.damping,
         )
 
     def _slow_down(self) -> None:

@@ -1,16 +1,18 @@
-"""Routes of what a job leaves: metrics, curve, log, and its progress as a stream of events."""
+"""Routes of the results of a job: metrics, curve, report, model and log; its progress as a stream of events."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from anyio import sleep, to_thread
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from graings.report.metrics_document import Metrics
+from graings.report.work_precision_document import REPORT_FILE, WorkPrecision
 from jobs.job import Job, JobNotFound, JobState
 from jobs.progress import last_start, read_progress
 from service.context import ContextDep, JobId
@@ -23,32 +25,54 @@ POLL_S = 0.5
 RECONNECT_MS = 2_000
 _MAX_LOG = 4 << 20
 
+# The framework describes the frame of a server-sent event; this adds what its data are.
+EVENT_STREAM: dict[str, Any] = {
+    "description": "`progress` events carry a ProgressReport, `state` and `end` events a JobResource.",
+    "content": {
+        "text/event-stream": {
+            "itemSchema": {
+                "properties": {
+                    "data": {
+                        "contentMediaType": "application/json",
+                        "contentSchema": {
+                            "anyOf": [
+                                {"$ref": "#/components/schemas/ProgressReport"},
+                                {"$ref": "#/components/schemas/JobResource"},
+                            ]
+                        },
+                    }
+                }
+            }
+        }
+    },
+}
 
-@router.get("/metrics", operation_id="get_metrics", response_class=Response)
+
+@router.get("/metrics", operation_id="get_metrics", response_model=Metrics)
 def metrics(job_id: JobId, here: ContextDep) -> Response:
-    """The metrics document, schema `graings.metrics/1`; it grows with every evaluation."""
+    """The metrics document, schema `graings.metrics/1`; it is rewritten after every evaluation."""
     path = _existing(here.store.folder(job_id).metrics, "metrics", "They come with the first evaluation.")
     return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
 
 
 @router.get("/curve.svg", operation_id="get_curve", response_class=FileResponse)
 def curve(job_id: JobId, here: ContextDep) -> Response:
-    """Held-out error against training time, as a picture."""
+    """Held-out error against training time, as a plot."""
     path = _existing(here.store.folder(job_id).curve, "curve", "It comes with the first evaluation.")
     return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
 
 
-@router.get("/report", operation_id="get_report", response_class=Response)
+@router.get("/report", operation_id="get_report", response_model=WorkPrecision)
 def report(job_id: JobId, here: ContextDep) -> Response:
     """The work-precision report, schema `graings.work_precision/1`: error against time, iterations and Gaussians."""
-    file = here.store.folder(job_id).report / "work_precision.json"
+    file = here.store.folder(job_id).report / REPORT_FILE
     path = _existing(file, "report", "It comes with the first evaluation.")
     return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
 
 
-@router.get("/report.svg", operation_id="get_report_picture", response_class=FileResponse)
-def report_picture(job_id: JobId, here: ContextDep) -> Response:
-    """The work-precision report as a picture."""
+@router.get("/report.svg", operation_id="get_report_plot", response_class=FileResponse)
+def report_plot(job_id: JobId, here: ContextDep) -> Response:
+    """The work-precision report as a plot."""
     file = here.store.folder(job_id).report / "training.svg"
     path = _existing(file, "report", "It comes with the first evaluation.")
     return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
@@ -74,17 +98,17 @@ def log(job_id: JobId, here: ContextDep, tail: Annotated[int, Query(ge=1, le=100
 
 
 def _known(job_id: JobId, here: ContextDep) -> Job:
-    """Looked up before the stream begins: afterwards it is too late for a 404."""
+    """The job, looked up before the stream begins: afterwards the status can no longer be 404."""
     return here.jobs.get(job_id)
 
 
-@router.get("/events", operation_id="get_events", response_class=EventSourceResponse)
+@router.get("/events", operation_id="get_events", response_class=EventSourceResponse, responses={200: EVENT_STREAM})
 async def events(
     request: Request,
     here: ContextDep,
     job: Annotated[Job, Depends(_known)],
     last_event_id: Annotated[
-        int | None, Header(ge=0, description="Go on after this event; 0 starts at the first report.")
+        int | None, Header(ge=0, description="Continue after this event; 0 starts at the first report.")
     ] = None,
 ) -> AsyncIterator[ServerSentEvent]:
     """`progress` (the trainer's reports), `state` (the job, whenever its state changes) and, last of all, `end`.
@@ -96,10 +120,10 @@ async def events(
     state: JobState | None = None
     while not await request.is_disconnected():
         try:
-            # State first: what was reported before the end is then surely read below.
+            # The state first: all that was reported before the job ended is then read below.
             job = await to_thread.run_sync(here.jobs.get, job.id)
         except JobNotFound:
-            return  # deleted while we watched
+            return  # the job was deleted
         lines, position = await to_thread.run_sync(read_progress, path, position)
         for place, report in lines:
             yield ServerSentEvent(event="progress", id=str(place), data=report, retry=RECONNECT_MS)

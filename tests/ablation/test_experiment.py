@@ -44,7 +44,7 @@ def folder(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return where
 
 
-def test_rows_that_nobody_named_are_left_out_where_they_say_nothing(capture: Path, tmp_path: Path) -> None:
+def test_unnamed_rows_that_equal_the_full_model_are_left_out(capture: Path, tmp_path: Path) -> None:
     whole = ablation(tmp_path, capture, preset="paper", settings={**SETTINGS, "batch": 1})
     assert [row.name for row in whole.rows] == [name for name in NAMES if name != "no_rigidity"]
     assert ["no_rigidity" in note and "left out" in note for note in whole.notes] == [True]
@@ -69,7 +69,7 @@ def test_every_run_is_an_ordinary_run_with_the_options_of_its_row(folder: Path) 
         )
 
 
-def test_the_table_holds_every_row_and_seed_and_says_what_is_missing(folder: Path) -> None:
+def test_the_table_holds_every_row_and_seed_also_unfinished_ones(folder: Path) -> None:
     document = table(folder)
     assert [row["name"] for row in document["rows"]] == NAMES
     assert document["split"] == "val"
@@ -110,7 +110,7 @@ def test_the_page_and_the_drawing_name_every_row_with_the_papers_difference(fold
     )  # legend, seed 0, seed 3
 
 
-def test_the_drawing_is_a_picture_too(folder: Path) -> None:
+def test_the_plot_is_written_as_png_too(folder: Path) -> None:
     image = pytest.importorskip("matplotlib.image", reason="PNG needs the extra plot").imread(folder / "ablation.png")
     seed = np.array([0x0D, 0x6B, 0x83]) / 255  # over paper at 0.55, see graings.ablation.plot
     paper = image[0, 0, :3]

@@ -1,4 +1,4 @@
-"""Each row is the method with one decision taken back, in its options and in what is computed."""
+"""Each row is the method with one design decision undone, in its options and in what is computed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_switches_of_the_method_are_the_defaults() -> None:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
-def test_a_row_differs_from_the_full_model_as_its_name_says_and_in_nothing_else(row: Any) -> None:
+def test_a_row_differs_from_the_full_model_only_as_its_name_says(row: Any) -> None:
     settings = {"iterations": 300, "capture": {"max_side": 32}}
     full, changed = (flat(row_config(one, "draft", settings, seed=4)) for one in (ROWS[0], row))
     assert {key: value for key, value in changed.items() if full[key] != value} == CHANGES[row.name]

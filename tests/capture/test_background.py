@@ -116,7 +116,9 @@ def test_a_run_says_and_keeps_it(capture: Path, tmp_path: Path) -> None:
     config = micro_config(**{"iterations": 2})
     run = TrainingRun.create(capture, tmp_path / "run", config)
     first = next(iter(run))
-    assert "background: #000000; where pictures show it there is nothing" in first.events
+    (event,) = (event for event in first.events if event.kind == "background")
+    assert event.color == (0.0, 0.0, 0.0)
+    assert event.message == "pixels of the colour #000000 count as background"
     run.save()
     assert open_model(tmp_path / "run").background == (0.0, 0.0, 0.0)
     again = TrainingRun.resume(tmp_path / "run")

@@ -142,7 +142,7 @@ def test_absent_perceptual_weights_are_named_and_never_fetched(tmp_path: Path, m
     assert list(tmp_path.iterdir()) == []
 
 
-def test_damaged_perceptual_weights_are_told_from_absent_ones(tmp_path: Path) -> None:
+def test_damaged_perceptual_weights_are_distinguished_from_absent_ones(tmp_path: Path) -> None:
     file = tmp_path / VGG_FILE
     assert "not installed" in str(_backbone_problem(file))
     file.write_bytes(b"half a download")
@@ -165,8 +165,8 @@ def test_images_too_small_for_the_network_have_no_perceptual_distance() -> None:
     assert SplitMetrics.over((large,), lpips.reason).lpips_vgg == large.lpips_vgg
 
 
-def test_without_a_distance_the_reason_is_that_none_was_asked_for(tmp_path: Path) -> None:
+def test_without_a_distance_the_reason_is_that_none_was_requested(tmp_path: Path) -> None:
     capture = load_capture(write_synthetic(tmp_path / "c", frames=4, size=40), CaptureConfig())
     images = ImageStore((1.0, 1.0, 1.0), 64)
     found = evaluate(tiny_scene(anchors=4), capture.train[:1], images, (1.0, 1.0, 1.0))
-    assert (found.lpips_vgg, found.lpips_reason) == (None, "LPIPS was not asked for")
+    assert (found.lpips_vgg, found.lpips_reason) == (None, "LPIPS was not requested")

@@ -50,7 +50,7 @@ def test_a_finished_job_has_its_report(tmp_path: Path) -> None:
     with trainer(folder) as process:
         assert process.wait(60) == ExitCode.DONE
     told, _ = read_progress(folder.progress, 0)
-    assert next(facts["attempt"] for _, facts in told if "attempt" in facts) == KEPT_ATTEMPTS + 2
+    assert told[0][1].attempt == KEPT_ATTEMPTS + 2
     document = json.loads((folder.report / "work_precision.json").read_text())
     assert document["training"][0]["run"]["name"] == folder.path.name
     assert len(document["render"][0]["points"]) > 1
@@ -99,7 +99,7 @@ def test_a_training_that_comes_apart_ends_diverged_with_a_model_and_a_last_repor
     assert json.loads(folder.metrics.read_text())["diverged"]
     last = last_progress(folder.progress)
     assert last is not None
-    assert (last["phase"], last["iteration"]) == ("diverged", model.iteration)
+    assert (last.phase, last.iteration) == ("diverged", model.iteration)
     reports, _ = read_progress(folder.progress, 0)
-    events = [event for _, report in reports for event in report.get("events", [])]
-    assert sum(event.startswith("rolled back") for event in events) == 3
+    kinds = [event.kind for _, report in reports for event in report.events]
+    assert (kinds.count("rolled_back"), kinds.count("diverged"), kinds[-1]) == (3, 1, "diverged")

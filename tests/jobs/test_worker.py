@@ -92,7 +92,7 @@ def test_a_job_outlives_kill_9_of_its_worker_and_leaving_brings_it_back_in_the_q
     assert folder.attempts()[-1].exit_code == ExitCode.STOPPED
     assert job.progress is not None
     assert job.checkpoint is not None
-    assert job.checkpoint >= job.progress["iteration"]
+    assert job.checkpoint >= job.progress.iteration
     assert list(jobs.store.workers.iterdir()) == []
 
 

@@ -14,7 +14,7 @@ from tests.report.reports import elements, part, point, words
 
 def run(name: str, *decibels: float, pace: float = 1.0, **changes: Any) -> dict[str, Any]:
     curve = [point(pace * 2.0**i, db, iteration=50 * 2**i, gaussians=1000 + 500 * i) for i, db in enumerate(decibels)]
-    return part(name, *curve, **changes)
+    return part(name, *curve, **changes).model_dump(mode="json")
 
 
 def rendered(name: str, *points: tuple[str, float, float, float]) -> dict[str, Any]:

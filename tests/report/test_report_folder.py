@@ -33,7 +33,7 @@ def read(folder: Path) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with a model that nobody trained."""
+    """A run with an untrained model."""
     folder = write_run(tmp_path_factory.mktemp("runs") / "tiny", metrics(*CURVE))
     eyes = ((0.0, -2.0, 0.5), (2.0, 0.0, 0.3))
     cameras = [Camera.look_at(eye, (0, 0, 0), fov=0.8, width=40, height=30) for eye in eyes]
@@ -58,31 +58,31 @@ def model(run: Path) -> Model:
     return load_model(run)
 
 
-def test_every_setting_is_measured_against_the_picture_without_cut_offs(model: Model) -> None:
+def test_every_setting_is_measured_against_the_rendering_without_cut_offs(model: Model) -> None:
     part = render_part("tiny", model)
-    points = part["points"]
-    assert [p["setting"] for p in points] == [way.to_json() for way in settings()]
-    assert part["views"] == {"split": "val", "names": ["view-0", "view-1"]}
-    assert all(p["ms"]["median"] > p["ms"]["networks"] > 0 and p["ms"]["iqr"] >= 0 for p in points)
+    points = part.points
+    assert [p.setting for p in points] == list(settings())
+    assert (part.views.split, part.views.names) == ("val", ("view-0", "view-1"))
+    assert all(p.ms.median > p.ms.networks > 0 and p.ms.iqr >= 0 for p in points)
 
     def error(sweep: str, key: str) -> list[float]:
         chosen = sorted(
-            (p for p in points if p["setting"]["sweep"] in (sweep, "default")), key=lambda p: p["setting"][key]
+            (p for p in points if p.setting.sweep in (sweep, "default")), key=lambda p: getattr(p.setting, key)
         )
-        return [p["err"]["rmse"] for p in chosen]
+        return [p.err.rmse for p in chosen]
 
     # Less is left out, less is wrong; and next to nothing left out is next to nothing wrong.
     assert error("alpha_min", "alpha_min") == sorted(error("alpha_min", "alpha_min"))
     assert 0 < min(error("alpha_min", "alpha_min")) < 1e-4
     assert error("resolution", "scale") == sorted(error("resolution", "scale"), reverse=True)
-    assert part["pareto"] == [i for i in part["pareto"] if points[i]["on_front"]]
-    assert sum(p["on_front"] for p in points) == len(part["pareto"]) >= 1
+    assert part.pareto == tuple(i for i in part.pareto if points[i].on_front)
+    assert sum(p.on_front for p in points) == len(part.pareto) >= 1
 
 
 def test_a_small_budget_draws_fewer_views_but_every_setting(model: Model) -> None:
     part = render_part("tiny", model, budget_s=0.0)
-    assert (len(part["views"]["names"]), part["rounds"]) == (1, 2)
-    assert len(part["points"]) == len(settings())
+    assert (len(part.views.names), part.rounds) == (1, 2)
+    assert len(part.points) == len(settings())
 
 
 def test_a_report_of_several_runs_is_complete(run: Path, tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_without_matplotlib_the_rest_is_written_and_the_extra_is_named(
 
 
 def test_a_run_in_the_middle_of_its_training_has_a_report_too(tmp_path: Path) -> None:
-    report_training("tiny", metrics(*CURVE, splits={}), {"config": {"iterations": 5000}}, tmp_path)
+    report_training("tiny", metrics(*CURVE, splits={}), make_config("draft", {"iterations": 5000}), tmp_path)
     (part,) = read(tmp_path)["training"]
     assert part["run"]["status"] == "unfinished"
     assert [entry["target_db"] for entry in part["time_to_psnr"] if entry["train_s"]] == [25, 30]

@@ -57,5 +57,5 @@ def test_a_job_that_diverges_says_so_and_its_best_model_can_be_looked_at(
     assert picture.headers["x-graings-iteration"] == str(job["checkpoint"]) == str(metrics["iterations"])
     assert picture.headers["x-graings-finished"] == "false"
     events: Any = client.get(job["links"]["events"], headers={"Last-Event-ID": "0"}).text
-    assert events.count("rolled back to iteration") == 3
+    assert events.count('"kind":"rolled_back"') == 3
     assert "event: end" in events

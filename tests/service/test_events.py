@@ -7,7 +7,8 @@ from typing import Any
 
 from starlette.testclient import TestClient
 
-from jobs.progress import ProgressWriter
+from graings.report.events import Grew
+from jobs.progress import ProgressReport, ProgressWriter
 from jobs.store import JobFolder
 
 Event = tuple[str, str | None, Any]
@@ -16,7 +17,8 @@ Event = tuple[str, str | None, Any]
 def report(folder: JobFolder, *iterations: int) -> None:
     writer = ProgressWriter(folder.progress)
     for iteration in iterations:
-        writer.write({"phase": "joint", "iteration": iteration, "iterations": 100, "attempt": 1})
+        event = Grew(iteration=iteration, anchors=5)
+        writer.write(ProgressReport(phase="joint", iteration=iteration, iterations=100, attempt=1, events=(event,)))
     writer.close()
 
 
@@ -45,6 +47,7 @@ def test_a_stream_starts_with_the_newest_report_and_ends_with_the_job(
     found = events(client, job)
     assert iterations(found) == [30]
     assert [event for event, _, _ in found] == ["progress", "state", "end"]
+    assert found[0][2]["events"] == [{"iteration": 30, "kind": "grew", "anchors": 5, "message": "grew 5 anchors"}]
     assert found[-1][2]["state"] == "cancelled"
     assert found[-1][2]["progress"]["iteration"] == 30
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -86,9 +87,9 @@ def plain_training(trainer: Trainer, dtype: torch.dtype, count: int) -> tuple[Sc
     return scene, found
 
 
-def said(reports: list[StepReport], word: str) -> list[str]:
-    """Events that begin with `word`."""
-    return [event for report in reports for event in report.events if event.startswith(word)]
+def events_of(reports: list[StepReport], kind: str | None = None) -> list[Any]:
+    """Events of this kind, or all."""
+    return [event for report in reports for event in report.events if kind in (None, event.kind)]
 
 
 def quality(trainer: Trainer) -> float:

@@ -7,6 +7,7 @@ import math
 import torch
 
 from graings.config import DensityConfig, TrainConfig
+from graings.report.events import Pruned
 from graings.scene.scaffold import Scaffold
 from graings.training.density.control import DensityControl
 from graings.training.density.growth import grow, new_anchor_opacity_offsets, prune, thin_out, voxel_keys
@@ -167,7 +168,7 @@ def test_an_anchor_that_showed_much_and_fades_is_pruned_at_the_second_look() -> 
             control.statistics.observe(
                 drawn, torch.zeros(len(drawn), 2), torch.ones(len(drawn), dtype=torch.bool), opacities, (8, 8)
             )
-        assert control.prune(scene, optimizer) == (["pruned 1 anchors"] if faded else [])
+        assert control.prune(7, scene, optimizer) == ([Pruned(iteration=7, anchors=1)] if faded else [])
     assert 3 not in scene.scaffold.uids.tolist()
 
 

@@ -27,7 +27,7 @@ from graings.training.initialization.initial_scene import (
 )
 from graings.training.initialization.triangulation import triangulate
 from tests.capture.captures import FOV, write_walled
-from tests.training.micro import GROWING, micro_trainer, quality, said, steps
+from tests.training.micro import GROWING, events_of, micro_trainer, quality, steps
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -155,8 +155,8 @@ def test_places_that_pictures_agree_on_are_worth_their_time(filled: Capture) -> 
     for options in ({}, {"init.min_mask_fraction": 0.0, "init.points": 600}):
         trainer = micro_trainer(filled.root, iterations=300, **{"density.max_anchors": 600}, **GROWING, **options)
         reports = steps(trainer, 300)
-        assert len(said(reports[:1], "first points: ")) == (0 if options else 1)
-        assert said(reports[1:], "first points") == []
+        assert len(events_of(reports[:1], "initial_points")) == (0 if options else 1)
+        assert events_of(reports[1:], "initial_points") == []
         found.append(quality(trainer))
     print(f"{found[0]:.2f} dB, from random points {found[1]:.2f} dB")
     assert found[0] > found[1] + 2

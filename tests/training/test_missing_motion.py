@@ -71,7 +71,7 @@ def train(run: TrainingRun, until: int) -> list[RunReport]:
 
 def again(reports: list[RunReport]) -> list[int]:
     """Where training began again."""
-    return [r.iteration for r in reports for event in r.events if event.startswith("time_window: begins again")]
+    return [r.iteration for r in reports for event in r.events if event.kind == "restart"]
 
 
 def test_a_lost_ball_makes_training_begin_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,8 +88,7 @@ def test_a_lost_ball_makes_training_begin_again(tmp_path: Path, monkeypatch: pyt
     facts = load_state(newest_checkpoint(run.folder) or Path()).facts
     assert facts["attempt"] == {"began": MIN_STEPS, "time_window": RESTART_WINDOWS[-1]}
     assert (run.iteration, facts["trainer"]["iteration"]) == (LATER, LATER - MIN_STEPS)
-    middle = [e for r in reports for e in r.events if e.startswith("time_window: begins with the middle 25 %")]
-    assert len(middle) == 1
+    assert [e.share for r in reports for e in r.events if e.kind == "time_window"] == [0.25]
     assert [point["iteration"] for point in facts["curve"]] == [27, 54, 108, 216, 432]
     # What an attempt that was given up once had is not the best model of this one, however well it did.
     assert facts["curve"][-1]["psnr"] < facts["curve"][-2]["psnr"]

@@ -23,7 +23,7 @@ from graings.training.run import TrainingRun
 from tests.capture.captures import orbit
 from tests.models import tiny_scene
 from tests.scenes import gaussians, pinhole, rows
-from tests.training.micro import finite, micro_config, micro_trainer, said, steps
+from tests.training.micro import events_of, finite, micro_config, micro_trainer, steps
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -64,7 +64,7 @@ def test_a_step_that_was_undone_is_not_told_of(micro: Path) -> None:
     with torch.no_grad():
         trainer.scene.scaffold.offsets[0] = math.inf
     report = trainer.step()
-    assert said([report], "rolled back")
+    assert events_of([report], "rolled_back")
     assert trainer.step_over_size == good
 
 
@@ -161,17 +161,19 @@ def test_a_run_says_how_stiff_it_was(micro: Path, tmp_path: Path) -> None:
         assert facts["views"] == 6
         assert 0 <= facts["subpixel_share"] <= 1
         assert document["curve"][-1]["step_over_size"] == found[name]
-        assert any(event.startswith("stiff: ") for event in reports[-1].events) is facts["stiff"]
-        assert any(event["what"].startswith("stiff: ") for event in document["events"]) is facts["stiff"]
+        assert bool(events_of(reports[-1:], "stiff")) is facts["stiff"]
+        assert any(event["kind"] == "stiff" for event in document["events"]) is facts["stiff"]
     assert found["calm"] < 0.1
     assert found["wild"] > 10 * found["calm"]
 
 
 def test_what_is_longer_than_itself_is_stiff_and_told_with_its_remedy() -> None:
-    assert Stiffness(1.5, 0.0, 6).events() == (
-        "stiff: the last steps still move the Gaussians by 1.5 times their own size (99th percentile). "
-        "Train longer, or with smaller last `rates` of offsets, deformation and matrices.",
+    (event,) = Stiffness(1.5, 0.0, 6).events(100)
+    assert (event.iteration, event.step_over_size) == (100, 1.5)
+    assert event.message == (
+        "the last steps still move Gaussians by 1.5 times their own size (99th percentile). "
+        "Train longer, or with lower final `rates` of offsets, deformation and matrices."
     )
     for calm in (Stiffness(1.0, 0.0, 6), Stiffness(None, None, 0)):
         assert not calm.stiff
-        assert calm.events() == ()
+        assert calm.events(100) == ()

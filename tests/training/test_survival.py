@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from graings.errors import DivergedError
 from graings.raster.rasterize import rasterize
 from graings.render import draw, render
+from graings.report.events import Event
 from graings.storage.checkpoint import load_model
 from graings.training.density.budget import affordable_anchors, bytes_per_anchor
 from graings.training.density.growth import MIN_ANCHORS
@@ -28,6 +29,7 @@ from graings.training.trainer import Trainer
 from tests.scenes import overlapping
 from tests.training.micro import (
     GROWING,
+    events_of,
     everywhere,
     finite,
     first,
@@ -35,7 +37,6 @@ from tests.training.micro import (
     micro_trainer,
     plain_training,
     quality,
-    said,
     spoil_gradient,
     spoil_loss,
     steps,
@@ -63,9 +64,9 @@ def test_a_bad_gradient_is_skipped_before_the_optimiser_sees_it(micro: Path, nam
     spoil_gradient(trainer, name, lambda i: i == 11, lambda gradient: first(gradient, bad))
     before = {key: value.clone() for key, value in trainer.scene.state_dict().items()}
     moments = {key: value.clone() for key, value in trainer.optimizer.state().items()}
-    events = said(steps(trainer, 1), "skipped")
+    events = events_of(steps(trainer, 1), "skipped")
     assert len(events) == 1
-    assert name in events[0]
+    assert name in events[0].non_finite
     assert all(torch.equal(value, before[key]) for key, value in trainer.scene.state_dict().items())
     assert all(torch.equal(value, moments[key]) for key, value in trainer.optimizer.state().items())
     steps(trainer, 1)
@@ -76,7 +77,7 @@ def test_a_run_with_a_bad_gradient_is_as_good_as_a_clean_one(micro: Path, clean:
     """E02, gradient at step 50."""
     trainer = micro_trainer(micro)
     spoil_gradient(trainer, BIAS, lambda i: i == 50, lambda gradient: first(gradient, BAD))
-    assert len(said(steps(trainer, 200), "skipped")) == 1
+    assert len(events_of(steps(trainer, 200), "skipped")) == 1
     assert (trainer.guard.skipped, trainer.guard.rollbacks) == (1, 0)
     assert quality(trainer) > clean - 0.5
 
@@ -87,7 +88,7 @@ def test_a_run_with_a_bad_loss_is_as_good_as_a_clean_one(
     """E02, loss at step 50."""
     trainer = micro_trainer(micro)
     spoil_loss(monkeypatch, trainer, lambda i: i == 50)
-    assert "the loss was not finite" in said(steps(trainer, 200), "skipped")[0]
+    assert events_of(steps(trainer, 200), "skipped")[0].non_finite == "the loss"
     assert quality(trainer) > clean - 0.5
 
 
@@ -105,8 +106,8 @@ def test_a_bad_moment_is_noticed_and_training_goes_back(micro: Path, moment: str
     trainer = micro_trainer(micro)
     steps(trainer, 52)
     trainer.optimizer.adam.state[trainer.scene.scaffold.features][moment][3, 2] = BAD
-    events = said(steps(trainer, 3), "rolled back to iteration 50")
-    assert len(events) == 1
+    events = events_of(steps(trainer, 3), "rolled_back")
+    assert [event.to_iteration for event in events] == [50]
     assert finite(trainer)
     assert trainer.guard.rollbacks == 1
     steps(trainer, 145)
@@ -123,7 +124,8 @@ def test_three_bad_steps_in_a_row_restore_scene_moments_streams_and_statistics(
     steps(trainer, 3)
     spoil_loss(monkeypatch, trainer, lambda i: i > 28)
     reports = steps(trainer, 3)
-    assert len(said(reports, "rolled back to iteration 25: the loss was not finite in 3 steps in a row")) == 1
+    (event,) = events_of(reports, "rolled_back")
+    assert (event.to_iteration, event.reason) == (25, "the loss was not finite in 3 steps in a row")
     scene, (tensors, facts) = trainer.scene.state_dict(), trainer.state()
     assert all(torch.equal(scene[name], good[0][name]) for name in good[0])
     same = [name for name in good[1] if not name.startswith("sampler")]
@@ -146,11 +148,7 @@ def test_going_back_in_vain_goes_back_further_and_in_the_end_gives_up(
     reports = [trainer.step() for _ in range(11)]
     with pytest.raises(DivergedError, match="after going back 3 times: the loss was not finite"):
         trainer.step()
-    assert [event.split(":")[0] for event in said(reports, "rolled back")] == [
-        "rolled back to iteration 50",
-        "rolled back to iteration 25",
-        "rolled back to iteration 25",
-    ]
+    assert [event.to_iteration for event in events_of(reports, "rolled_back")] == [50, 25, 25]
     assert trainer.iteration == 72
     trainer.restore()
     assert trainer.iteration == 25
@@ -161,8 +159,10 @@ def test_a_loss_that_runs_away_with_finite_numbers_goes_back(micro: Path, monkey
     trainer = micro_trainer(micro, **{"guard.patience": 20})
     steps(trainer, 100)
     spoil_loss(monkeypatch, trainer, lambda i: i > 100, factor=50.0)
-    events = said(steps(trainer, 60), "rolled back to iteration 100: the mean loss was")
-    assert events  # and not to a moment taken when the loss was already running away
+    events = events_of(steps(trainer, 60), "rolled_back")
+    assert events
+    assert events[0].reason.startswith("the mean loss was")
+    assert events[0].to_iteration == 100  # and not to a moment taken when the loss was already running away
 
 
 def test_a_hundredfold_rate_ends_converged_or_diverged_with_a_model_that_renders(micro: Path, tmp_path: Path) -> None:
@@ -191,7 +191,8 @@ def test_a_finite_spike_is_limited_and_does_not_freeze_its_parameter(micro: Path
     spoil_gradient(trainer, BIAS, lambda i: i != 60, everywhere(0.01))
     spoil_gradient(trainer, BIAS, lambda i: i == 60, lambda gradient: first(everywhere(0.01)(gradient), 1e10))
     steps(trainer, 59)
-    assert len(said(steps(trainer, 1), "clipped: gradients of color at 1e+10")) == 1
+    (event,) = events_of(steps(trainer, 1), "clipped")
+    assert (event.group, f"{event.norm:.3g}") == ("color", "1e+10")
     values = dict(trainer.scene.named_parameters())[BIAS]
     ratios = []
     for iteration in range(61, 261):
@@ -220,7 +221,8 @@ def test_a_finite_spike_does_not_stop_the_rest_of_its_matrix(micro: Path) -> Non
         sizes.append(float(moved) / trainer.optimizer.rate("matrices", iteration, like="deformation"))
         if iteration == 100:
             assert len(events) == 1
-            assert events[0].startswith("clipped: gradients of deformation at 1e+10")
+            assert (events[0].kind, events[0].group) == ("clipped", "deformation")
+            assert f"{events[0].norm:.3g}" == "1e+10"
     normal = sum(sizes[60:99]) / 39
     assert min(sizes[100:]) >= 0.5 * normal
     assert finite(trainer)
@@ -233,7 +235,7 @@ def test_gradients_that_are_nothing_or_almost_move_nothing(micro: Path, number: 
     before = {name: value.detach().clone() for name, value in trainer.scene.named_parameters()}
     for name in before:
         spoil_gradient(trainer, name, lambda _: True, everywhere(number))
-    assert said(steps(trainer, 100), "") == []
+    assert events_of(steps(trainer, 100)) == []
     assert finite(trainer)
     for name, value in trainer.scene.named_parameters():
         assert float((value.detach() - before[name]).abs().max()) <= drift, name
@@ -270,7 +272,7 @@ def test_growth_without_end_stops_at_the_budget(micro: Path, batch: int) -> None
     start = _peak_bytes()
     reports = steps(trainer, 48)
     assert trainer.scene.scaffold.count == most
-    assert said(reports, "growth_capped")
+    assert events_of(reports, "growth_capped")
     assert _peak_bytes() - start < memory_mb * 1_000_000
     assert finite(trainer)
 
@@ -286,7 +288,7 @@ def test_anchors_that_show_nothing_make_room_for_growth(micro: Path) -> None:
         scaffold.opacity_offsets[showing:] = -5.0
     reports = steps(trainer, 60)
     uids = set(trainer.scene.scaffold.uids.tolist())
-    assert said(reports, "pruned")
+    assert events_of(reports, "pruned")
     assert uids.isdisjoint(range(showing, count))
     assert max(uids) >= count, "something was born in their place"
     assert len(uids) <= 60
@@ -301,11 +303,11 @@ def test_more_than_the_budget_from_the_first_step_on_is_thinned(micro: Path) -> 
         assert trainer.scene.scaffold.count > 40, "as a floor that nobody looks at has"
         reports = steps(trainer, 400)
         found[most] = quality(trainer)
-        assert len(said(reports, "thinned")) == (1 if most == 40 else 0)
+        assert len(events_of(reports, "thinned")) == (1 if most == 40 else 0)
         assert trainer.scene.scaffold.count <= most
         if most == 40:
-            after = next(i for i, report in enumerate(reports) if said([report], "thinned"))
-            assert said(reports[after + 1 :], "grew"), "there is room again"
+            after = next(i for i, report in enumerate(reports) if events_of([report], "thinned"))
+            assert events_of(reports[after + 1 :], "grew"), "there is room again"
     print(f"with 40 anchors {found[40]:.2f} dB, with as many as it likes {found[20_000]:.2f} dB")
     assert found[40] > found[20_000] - 3
 
@@ -424,14 +426,16 @@ def test_a_scene_in_which_all_is_hidden_is_shown_again_once_and_then_goes_back(m
     before = quality(trainer)
     reports = steps(trainer, 6)
     assert [report.gaussians for report in reports] == [0] * 6
-    assert len(said(reports, "opacity_rebias")) == 1
+    assert len(events_of(reports, "opacity_reset")) == 1
     assert trainer.step().gaussians > 0
-    assert said(steps(trainer, 120), "opacity_rebias") == []
+    assert events_of(steps(trainer, 120), "opacity_reset") == []
     assert quality(trainer) > before + 3
     _drive(trainer, trainer.scene.appearance.opacity[-1], -3.0)
     again = steps(trainer, 20)
-    assert said(again, "opacity_rebias") == []
-    assert len(said(again, "rolled back to iteration 125: nothing was drawn any more")) == 1
+    assert events_of(again, "opacity_reset") == []
+    (event,) = events_of(again, "rolled_back")
+    assert event.to_iteration == 125
+    assert event.reason.startswith("nothing was drawn any more")
 
 
 def _noisy_rotations(capture: Path, count: int) -> Iterator[tuple[int, Tensor]]:
@@ -484,7 +488,7 @@ def test_children_born_in_one_place_part(micro: Path) -> None:
     """E18: 100 iterations after the birth of anchors with zero offsets, of which some view has seen something."""
     trainer = micro_trainer(micro, **GROWING)
     old = trainer.density.next_uid
-    assert said(steps(trainer, 100), "grew")
+    assert events_of(steps(trainer, 100), "grew")
     steps(trainer, 100)
     moments = trainer.optimizer.adam.state[trainer.scene.scaffold.offsets]["exp_avg_sq"]
     born = (trainer.scene.scaffold.uids >= old) & (moments > 0).flatten(1).all(1)
@@ -501,9 +505,9 @@ def test_growing_does_not_tear_the_picture(micro: Path, monkeypatch: pytest.Monk
     drops: list[float] = []
     grow = trainer.density.grow
 
-    def measured(*scene: Any) -> tuple[int, list[str]]:
+    def measured(*arguments: Any) -> tuple[int, list[Event]]:
         before = quality(trainer)
-        born, events = grow(*scene)
+        born, events = grow(*arguments)
         if events:
             drops.append(before - quality(trainer))
         return born, events

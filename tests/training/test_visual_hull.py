@@ -19,7 +19,7 @@ from graings.random import RandomStreams
 from graings.training.initialization.initial_scene import initial_points
 from graings.training.initialization.visual_hull import MIN_CARVED, MIN_COVERAGE, carve, coverage, masked
 from tests.capture.captures import without_alpha, write_image
-from tests.training.micro import GROWING, micro_trainer, quality, said, steps
+from tests.training.micro import GROWING, events_of, micro_trainer, quality, steps
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -104,8 +104,8 @@ def test_what_flies_is_not_lost(flight: Path) -> None:
             few = {"iterations": 400, "seed": seed, "init.points": 20_000}
             trainer = micro_trainer(flight, **few, **GROWING, **options)
             reports = steps(trainer, 400)
-            assert len(said(reports[:1], "time_window: begins with the middle")) == (0 if options else 1)
-            assert said(reports[1:], "time_window") == []
+            assert len(events_of(reports[:1], "time_window")) == (0 if options else 1)
+            assert events_of(reports[1:], "time_window") == []
             found.append(quality(trainer))
         print(f"seed {seed}: by itself {found[0]:.2f} dB, the whole clip from the start {found[1]:.2f} dB")
         gains.append(found[0] - found[1])

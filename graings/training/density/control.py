@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from graings.config import TrainConfig
+from graings.report.events import Event, Grew, GrowthCapped, Pruned, Thinned
 from graings.scene.scene import Scene
 from graings.training.density import growth
 from graings.training.density.budget import most_anchors
@@ -54,15 +55,20 @@ class DensityControl:
         first, last = self.scaled(self.config.prune_from), self.scaled(self.config.prune_until)
         return first <= iteration <= last and iteration % max(1, self.scaled(self.config.prune_every)) == 0
 
-    def grow(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> tuple[int, list[str]]:
-        """Add anchors where the pictures ask for them; returns how many, and what happened in words."""
-        events: list[str] = []
+    def grow(
+        self, iteration: int, scene: Scene, optimizer: Optimizer, generator: torch.Generator
+    ) -> tuple[int, list[Event]]:
+        """Add anchors where the gradients of the projected centres are large; returns how many, and what happened.
+
+        `iteration` is that of the run, for the events.
+        """
+        events: list[Event] = []
         # Anchors that show nothing would keep others from growing for good: what is not drawn does not come back.
         if scene.scaffold.count > NEAR_BUDGET * self.config.max_anchors:
             judged = float((self.statistics.visits > self.config.prune_min_views).double().mean())
-            events = self.prune(scene, optimizer)
+            events = self.prune(iteration, scene, optimizer)
             if judged > MIN_OBSERVED_FRACTION and scene.scaffold.count > self.config.max_anchors:
-                events += self._thin(scene, optimizer, generator)
+                events += self._thin(iteration, scene, optimizer, generator)
         grown = growth.grow(
             scene.scaffold,
             self.statistics,
@@ -74,16 +80,17 @@ class DensityControl:
         )
         self.statistics.forget_grown(self.config.min_observations)
         if grown.capped:
-            events.append("growth_capped: the budget of anchors is used up or too many wanted to grow")
+            anchors = scene.scaffold.count + len(grown)
+            events.append(GrowthCapped(iteration=iteration, anchors=anchors, max_anchors=self.config.max_anchors))
         if len(grown) > 0:
             optimizer.append(grown.rows)
             self.statistics.resize(append=len(grown))
             self.next_uid += len(grown)
-            events.insert(0, f"grew {len(grown)} anchors")
+            events.insert(0, Grew(iteration=iteration, anchors=len(grown)))
         return len(grown), events
 
-    def prune(self, scene: Scene, optimizer: Optimizer) -> list[str]:
-        """Remove anchors that show nothing; returns what happened, in words."""
+    def prune(self, iteration: int, scene: Scene, optimizer: Optimizer) -> list[Event]:
+        """Remove anchors that show nothing; returns what happened. `iteration` is that of the run."""
         keep = growth.prune(scene.scaffold, self.statistics, self.config)
         self.statistics.forget_judged(self.config.prune_min_views)
         removed = int((~keep).sum())
@@ -91,17 +98,17 @@ class DensityControl:
             return []
         optimizer.keep(keep)
         self.statistics.resize(keep=keep)
-        return [f"pruned {removed} anchors"]
+        return [Pruned(iteration=iteration, anchors=removed)]
 
-    def _thin(self, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> list[str]:
-        """Make room where what stood from the first is more than may be; returns what happened, in words."""
+    def _thin(self, iteration: int, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> list[Event]:
+        """Make room for growth where the initial anchors are more than the budget; returns what happened."""
         count, most = scene.scaffold.count, max(2, int(THINNED_FRACTION * self.config.max_anchors))
         keep, wider = growth.thin_out(scene.scaffold, self.statistics, most, generator)
         with torch.no_grad():
             scene.scaffold.log_scales.add_(wider.unsqueeze(-1))
         optimizer.keep(keep)
         self.statistics.resize(keep=keep)
-        return [f"thinned {count} anchors to {most}: more stood from the first than the budget holds"]
+        return [Thinned(iteration=iteration, anchors_before=count, anchors_after=most)]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Statistics, and facts as JSON."""

@@ -21,6 +21,7 @@ from graings.camera.camera import Camera
 from graings.capture.capture import Frame
 from graings.gaussians import Gaussians
 from graings.render import draw, low_pass
+from graings.report.events import Stiff
 from graings.scene.children import quaternion_product
 from graings.scene.scene import Scene
 
@@ -53,14 +54,11 @@ class Stiffness:
         """Whether the last step that was measured was too long for the scene."""
         return self.step_over_size is not None and self.step_over_size > STIFF
 
-    def events(self) -> tuple[str, ...]:
-        """What a user is told of a run that ended like this."""
-        if not self.stiff:
+    def events(self, iteration: int) -> tuple[Stiff, ...]:
+        """The event of a run that ended like this after `iteration`, if it was stiff."""
+        if self.step_over_size is None or not self.stiff:
             return ()
-        return (
-            f"stiff: the last steps still move the Gaussians by {self.step_over_size:.3g} times their own size "
-            "(99th percentile). Train longer, or with smaller last `rates` of offsets, deformation and matrices.",
-        )
+        return (Stiff(iteration=iteration, step_over_size=self.step_over_size),)
 
 
 def step_over_size(before: Gaussians, after: Gaussians, camera: Camera, blur: float) -> float | None:

@@ -21,6 +21,7 @@ from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.random import RandomStreams
+from graings.report.events import PointsInitialized
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.training.curriculum.time_window import TimeWindow
@@ -62,16 +63,16 @@ class InitialScene:
     scene: Scene
     voxel_size: float  # normalised units
     time_window: float  # share of the clip that training begins with
-    notes: tuple[str, ...]  # what was decided on the way, in words
+    notes: tuple[PointsInitialized, ...]  # how the points were chosen, where masks did not
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialPoints:
-    """Positions [M, 3] to start from, the `time_window` they stand for, and what was decided, in words."""
+    """Positions [M, 3] to start from, the `time_window` they stand for, and how they were chosen."""
 
     positions: NDArray[np.float64]
     time_window: float
-    notes: tuple[str, ...] = ()
+    notes: tuple[PointsInitialized, ...] = ()
 
 
 def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: RandomStreams) -> InitialScene:
@@ -126,27 +127,27 @@ def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, st
     order = torch.randperm(len(capture.train), generator=generator).tolist()
     whole = _voters(capture, images, config, order, 1.0)
     check_not_empty(whole)  # in a part of the clip all may be out of sight
-    notes: tuple[str, ...] = ()
+    notes: tuple[PointsInitialized, ...] = ()
     if np.mean([view.mask.mean() for view in whole]) > FILLED:
-        places, notes = _agreed(capture, images)
+        places, note = _agreed(capture, images)
+        notes = (note,)
         if places is not None:
             return InitialPoints(_subsampled(places, lasting, generator), window, notes)
     carved, window = _carved(cube, order, whole, capture, images, config) or (cube, window)
     return InitialPoints(_subsampled(carved, most, generator), window, notes)
 
 
-def _agreed(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """What pairs of pictures agree on, None where that is too little; and what becomes of it, in words."""
+def _agreed(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, PointsInitialized]:
+    """Points [M, 3] triangulated from pairs of images, None where there are too few; and the event for the report."""
     try:
         found = triangulate(capture.train, images)
     except ImportError:
-        hint = "pip install graings[colmap] takes them from what the pictures have in common"
-        return None, (f"first points: random, for the pictures are filled and there is no cloud; {hint}",)
+        return None, PointsInitialized(iteration=0, source="random", triangulated=None)
     count = len(found.places)
     if count < MIN_CARVED:
-        return None, (f"first points: random, for pairs of pictures agree on {count} places only",)
-    said = f"first points: {count:,} places that pairs of pictures agree on, and {len(found.filled):,} between them"
-    return np.concatenate([found.places, found.filled]), (said,)
+        return None, PointsInitialized(iteration=0, source="random", triangulated=count)
+    event = PointsInitialized(iteration=0, source="triangulation", triangulated=count, interpolated=len(found.filled))
+    return np.concatenate([found.places, found.filled]), event
 
 
 def _voters(

@@ -1,0 +1,263 @@
+"""Events: what happened in a training run beside its ordinary steps, one small model for each kind.
+
+An event is its iteration, its kind and numbers. The message for people is derived from them, and travels with the
+event wherever it is written. Programs decide by `kind`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal, Self
+
+from pydantic import Field, computed_field, model_validator
+
+from graings.document import Document
+
+Channel = Annotated[float, Field(ge=0, le=1)]
+
+KIND: Final = "Kind of the event."
+
+
+class _Event(Document):
+    """What all events share."""
+
+    iteration: int = Field(ge=0, description="Iteration of the run in which it happened; 0 before the first step.")
+
+    @computed_field(description="The event in plain words, derived from its numbers.")  # type: ignore[prop-decorator]
+    @property
+    def message(self) -> str:
+        """The event in plain words."""
+        return self._words()
+
+    def _words(self) -> str:
+        raise NotImplementedError
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_message(cls, values: Any) -> Any:
+        """The message is written, but not read: it follows from the other fields."""
+        return {key: values[key] for key in values if key != "message"} if isinstance(values, dict) else values
+
+    def at(self, iteration: int) -> Self:
+        """The same event at another iteration."""
+        return self.model_copy(update={"iteration": iteration})
+
+
+class BackgroundFound(_Event):
+    """The colour of the background is not white."""
+
+    kind: Literal["background"] = Field("background", description=KIND)
+    color: tuple[Channel, Channel, Channel] = Field(description="RGB in [0, 1].")
+
+    def _words(self) -> str:
+        name = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.color)
+        return f"pixels of the colour {name} count as background"
+
+
+class PointsInitialized(_Event):
+    """Where the first anchors come from, in a capture without point cloud whose masks cover the whole image."""
+
+    kind: Literal["initial_points"] = Field("initial_points", description=KIND)
+    source: Literal["random", "triangulation"] = Field(
+        description="random: uniform in a cube. triangulation: matched between pairs of images."
+    )
+    triangulated: int | None = Field(
+        ge=0, description="Points matched between pairs of images; null without the extra graings[colmap]."
+    )
+    interpolated: int = Field(0, ge=0, description="Points added between the triangulated ones.")
+
+    def _words(self) -> str:
+        if self.source == "triangulation":
+            count, between = f"{self.triangulated:,}", f"{self.interpolated:,}"
+            return f"initial points: {count} triangulated from pairs of images, {between} interpolated between them"
+        if self.triangulated is None:
+            return (
+                "initial points: random, because there is neither a point cloud nor a mask; "
+                "with the extra graings[colmap] they are triangulated from the images"
+            )
+        return f"initial points: random, because only {self.triangulated} could be triangulated from pairs of images"
+
+
+class TimeWindowStarted(_Event):
+    """Training begins with a part of the clip."""
+
+    kind: Literal["time_window"] = Field("time_window", description=KIND)
+    share: float = Field(gt=0, lt=1, description="Share of the clip, around its middle, that the first steps use.")
+
+    def _words(self) -> str:
+        return f"training begins with the middle {100 * self.share:.3g} % of the clip and widens to all of it"
+
+
+class LowResolutionStarted(_Event):
+    """Training begins with downscaled images."""
+
+    kind: Literal["low_resolution"] = Field("low_resolution", description=KIND)
+    factor: int = Field(gt=1, description="How many times smaller along each side the first images are.")
+
+    def _words(self) -> str:
+        return f"training begins with images of 1/{self.factor} of their width and height"
+
+
+class Grew(_Event):
+    """Anchors were added."""
+
+    kind: Literal["grew"] = Field("grew", description=KIND)
+    anchors: int = Field(gt=0, description="How many anchors were added.")
+
+    def _words(self) -> str:
+        return f"grew {self.anchors:,} anchors"
+
+
+class GrowthCapped(_Event):
+    """More anchors qualified for growth than could be added."""
+
+    kind: Literal["growth_capped"] = Field("growth_capped", description=KIND)
+    anchors: int = Field(ge=0, description="Anchors of the scene after this growth.")
+    max_anchors: int = Field(gt=0, description="Anchors that the scene may have.")
+
+    def _words(self) -> str:
+        return (
+            f"growth was limited: {self.anchors:,} of at most {self.max_anchors:,} anchors, "
+            "and more qualified than may be added at once"
+        )
+
+
+class Pruned(_Event):
+    """Anchors that show nothing were removed."""
+
+    kind: Literal["pruned"] = Field("pruned", description=KIND)
+    anchors: int = Field(gt=0, description="How many anchors were removed.")
+
+    def _words(self) -> str:
+        return f"pruned {self.anchors:,} anchors"
+
+
+class Thinned(_Event):
+    """More anchors were there from the start than the budget allows: a random part of them was removed."""
+
+    kind: Literal["thinned"] = Field("thinned", description=KIND)
+    anchors_before: int = Field(gt=0, description="Anchors before.")
+    anchors_after: int = Field(gt=0, description="Anchors after.")
+
+    def _words(self) -> str:
+        return (
+            f"thinned {self.anchors_before:,} anchors to {self.anchors_after:,}: the budget leaves no room for growth"
+        )
+
+
+class GradientsClipped(_Event):
+    """The gradients of one group of parameters were far above their usual norm and were scaled down."""
+
+    kind: Literal["clipped"] = Field("clipped", description=KIND)
+    group: str = Field(description="Parameter group; screen: gradients of the projected centres.")
+    norm: float = Field(gt=0, description="Euclidean norm of the group's gradients.")
+    limit: float = Field(gt=0, description="Norm they were scaled down to.")
+    views: tuple[str, ...] = Field(description="Views of the step.")
+
+    def _words(self) -> str:
+        views = ", ".join(self.views)
+        return f"gradients of {self.group} clipped from norm {self.norm:.3g} to {self.limit:.3g} (views {views})"
+
+
+class StepSkipped(_Event):
+    """The loss or a gradient was not finite; the parameters were left as they were."""
+
+    kind: Literal["skipped"] = Field("skipped", description=KIND)
+    non_finite: str = Field(description="What was not finite: the loss, or the gradient of a parameter.")
+    views: tuple[str, ...] = Field(description="Views of the step.")
+    times: tuple[float, ...] = Field(description="Normalised times of these views.")
+
+    def _words(self) -> str:
+        views = ", ".join(self.views)
+        return f"step skipped: {self.non_finite} was not finite (views {views} at t = {_list(self.times)})"
+
+
+class RolledBack(_Event):
+    """Training went wrong and continues from an earlier state, with lower learning rates and another order of views."""
+
+    kind: Literal["rolled_back"] = Field("rolled_back", description=KIND)
+    to_iteration: int = Field(ge=0, description="Iteration of the run whose state was restored.")
+    reason: str = Field(description="What went wrong, in plain words.")
+    rate_factor: float = Field(gt=0, le=1, description="Factor on all learning rates from here on.")
+
+    def _words(self) -> str:
+        return (
+            f"rolled back to iteration {self.to_iteration:,}: {self.reason}; "
+            f"learning rates are {self.rate_factor:.3g} of their schedule from here on"
+        )
+
+
+class OpacityReset(_Event):
+    """In a whole pass over the views nothing was drawn: opacities were raised."""
+
+    kind: Literal["opacity_reset"] = Field("opacity_reset", description=KIND)
+    opacity: float = Field(gt=0, lt=1, description="Opacity that the median Gaussian got.")
+    shift: float = Field(description="What was added to all opacity logits.")
+
+    def _words(self) -> str:
+        return (
+            f"opacities reset to {self.opacity} (logits {self.shift:+.3g}), because nothing was drawn in a whole pass "
+            "over the views. With large motion, train with a smaller `time_window`."
+        )
+
+
+class Restarted(_Event):
+    """A large moving object was missing in many views: training starts again on a part of the clip."""
+
+    kind: Literal["restart"] = Field("restart", description=KIND)
+    missing_share: float = Field(ge=0, le=1, description="Share of the checked training views in which it was missing.")
+    time_window: float = Field(gt=0, lt=1, description="Share of the clip that the new start begins with.")
+
+    def _words(self) -> str:
+        return (
+            f"training starts again with the middle {100 * self.time_window:.3g} % of the clip: in "
+            f"{self.missing_share:.0%} of the views a large moving object was missing. `time_window=1` prevents this."
+        )
+
+
+class Stiff(_Event):
+    """The last optimiser steps were longer than the Gaussians they moved."""
+
+    kind: Literal["stiff"] = Field("stiff", description=KIND)
+    step_over_size: float = Field(
+        gt=1, description="Length of a step over the size of the Gaussian it moved, 99th percentile."
+    )
+
+    def _words(self) -> str:
+        return (
+            f"the last steps still move Gaussians by {self.step_over_size:.3g} times their own size (99th percentile). "
+            "Train longer, or with lower final `rates` of offsets, deformation and matrices."
+        )
+
+
+class Diverged(_Event):
+    """Training went wrong once more than it may roll back, and ended."""
+
+    kind: Literal["diverged"] = Field("diverged", description=KIND)
+    reason: str = Field(description="What went wrong, in plain words.")
+
+    def _words(self) -> str:
+        return self.reason
+
+
+Event = Annotated[
+    BackgroundFound
+    | PointsInitialized
+    | TimeWindowStarted
+    | LowResolutionStarted
+    | Grew
+    | GrowthCapped
+    | Pruned
+    | Thinned
+    | GradientsClipped
+    | StepSkipped
+    | RolledBack
+    | OpacityReset
+    | Restarted
+    | Stiff
+    | Diverged,
+    Field(discriminator="kind"),
+]
+
+
+def _list(numbers: tuple[float, ...]) -> str:
+    return ", ".join(f"{number:.4g}" for number in numbers)
