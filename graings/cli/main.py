@@ -26,7 +26,7 @@ from rich.text import Text
 from graings.camera.camera import Camera
 from graings.camera.viewpoint import background_rgb, named_view, orbit_view, pose_camera, sized
 from graings.cli.synthesize import synthesize
-from graings.cli.terminal import metrics_line, say
+from graings.cli.terminal import metrics_line, motion_line, say
 from graings.cli.training import Lists, Threads, ablate, train
 from graings.config import ConfigSection, make_config, options
 from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
@@ -35,6 +35,7 @@ from graings.kernel import use_threads
 from graings.render import render
 from graings.report.evaluate_run import evaluate_run
 from graings.report.folder import report_runs
+from graings.report.metrics_document import METRICS_FILE, read_metrics
 from graings.report.work_precision import summary
 from graings.storage.compact import SUFFIX, open_model, write_compact
 from graings.storage.model import Model, scene_bytes
@@ -178,6 +179,9 @@ def evaluate(
         raise typer.BadParameter(str(error), param_hint="--background") from error
     say(metrics_line(split, evaluate_run(run, split, capture, rgb)))
     if rgb is None:
+        motion = read_metrics(run / METRICS_FILE).motion
+        if motion is not None:
+            say(motion_line(motion))
         say(f"Written to {run / 'metrics.json'}.")
     else:
         say(f"On {background}; metrics.json keeps the numbers on the background of training.")

@@ -21,6 +21,7 @@ from graings.capture.synthetic.catalogue import scene_named
 from graings.capture.synthetic.shapes import Room
 from graings.capture.synthetic.world import World
 from graings.capture.trajectories import read_trajectories
+from graings.errors import CaptureError
 
 SIZE, VIEWS, SEED = 32, 3, 3
 NAMES = [scene.name for scene in SUITE]
@@ -223,5 +224,5 @@ def test_a_wrong_request_is_refused(tmp_path: Path) -> None:
         synthesize("globe", tmp_path / "x", size=0)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
-    with pytest.raises(FileExistsError, match="not empty"):
+    with pytest.raises(CaptureError, match="not empty"):
         synthesize("globe", tmp_path / "full")

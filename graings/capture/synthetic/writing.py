@@ -25,6 +25,7 @@ from graings.capture.synthetic.drawing import draw
 from graings.capture.synthetic.recording import Shot, shots
 from graings.capture.synthetic.tracking import track
 from graings.capture.trajectories import FILE
+from graings.errors import CaptureError
 
 Observer = Callable[[int, int], None]  # images done, images in all
 
@@ -43,13 +44,13 @@ def synthesize(
 
     Pixels, cameras and trajectories have the same bits on every machine and for every number of processes. The
     transforms files come last: an interrupted folder does not load. Raises `ValueError` for an unknown name, a size or
-    a number of views below 1, and `FileExistsError` for a folder that is not empty.
+    a number of views below 1, and `CaptureError` for a folder that is not empty.
     """
     if size < 1 or views < 1:
         raise ValueError(f"size and views must be at least 1, got {size} and {views}")
     world = scene_named(name).build(seed)
     if folder.is_dir() and any(folder.iterdir()):
-        raise FileExistsError(f"{folder}: is not empty. Name another folder.")
+        raise CaptureError("is not empty", file=folder, remedy="Name another folder.")
     splits = shots(world, size=size, views=views, seed=seed)
     for split in splits:
         for parent in (folder, folder / "depth", folder / "moving"):
