@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
 from graings.camera.units import Units
-from graings.capture.capture import SPLITS, Capture, Frame, PointCloud
+from graings.capture.capture import ALL_SPLITS, Capture, Frame, PointCloud
 from graings.capture.raw_capture import MAX_DISTANCE, RawCapture, RawFrame
 from graings.errors import CaptureError
 
@@ -37,7 +37,7 @@ NEARLY_AXIS = math.cos(math.radians(10.0))
 def normalize(recording: RawCapture, *, root: Path, max_side: int | None, content_hash: str) -> Capture:
     """The capture in normalised units, its cameras reduced to `max_side` px."""
     notes = list(recording.notes)
-    shots = [shot for split in SPLITS for shot in recording.splits[split]]
+    shots = [shot for split in ALL_SPLITS for shot in recording.splits.get(split, ())]
     for shot in shots:
         for field, size in (("camera position", np.abs(shot.camera.center).max()), ("time", abs(shot.time or 0.0))):
             if size > MAX_DISTANCE:
@@ -85,7 +85,7 @@ def normalize(recording: RawCapture, *, root: Path, max_side: int | None, conten
             lens=shot.lens,
         )
 
-    splits = {split: tuple(frame(shot) for shot in recording.splits[split]) for split in SPLITS}
+    splits = {split: tuple(frame(shot) for shot in recording.splits.get(split, ())) for split in ALL_SPLITS}
     points = None
     if recording.positions is not None and recording.colors is not None:
         points = PointCloud(units.points(recording.positions), recording.colors)
@@ -95,6 +95,7 @@ def normalize(recording: RawCapture, *, root: Path, max_side: int | None, conten
         train=splits["train"],
         val=splits["val"],
         test=splits["test"],
+        between=splits["between"],
         units=units,
         has_alpha=any(shot.image.has_alpha for shot in shots),
         points=points,

@@ -164,7 +164,7 @@ def export(
 @app.command()
 def evaluate(
     run: Run,
-    split: Annotated[Literal["val", "test"], typer.Option(help="Held-out views to measure.")] = "val",
+    split: Annotated[Literal["val", "test", "between"], typer.Option(help="Held-out views to measure.")] = "val",
     capture: Annotated[Path | None, typer.Option(help="Where the capture lies now, if it moved.")] = None,
     background: Annotated[
         str | None, typer.Option(help="white, black, #rrggbb or r,g,b instead of training's; only told, not written.")

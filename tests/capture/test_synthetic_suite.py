@@ -64,6 +64,9 @@ def test_a_scene_loads_through_the_reader(suite: Path, name: str) -> None:
     assert len(capture.train) == (24 if name == "rig" else VIEWS)
     assert len(capture.val) == 1
     assert len(capture.test) == 2
+    assert len(capture.between) == (0 if name == "still" else 2)
+    assert all(0.0 < frame.time < 1.0 for frame in capture.between)
+    assert not {frame.time for frame in capture.between} & set(capture.times.tolist())
     assert capture.has_alpha == (name not in ROOMS)
     images = ImageStore((1.0, 1.0, 1.0), 16)
     for frame in capture.train[:2]:

@@ -34,7 +34,8 @@ def test_a_synthetic_scene_is_written_trained_and_scored(tmp_path: Path, capsys:
     assert len(load_capture(capture).train) == 6
     assert graings("train", capture, "-o", run, *TINY, "--set", "iterations=10") == 0
     assert read_metrics(run / METRICS_FILE).motion is None
-    assert graings("evaluate", run, "--split", "test") == 0
+    assert graings("evaluate", run, "--split", "between") == 0
+    assert set(read_metrics(run / METRICS_FILE).splits) == {"val", "between"}
     motion = read_metrics(run / METRICS_FILE).motion
     assert motion is not None
     assert motion.points == 200

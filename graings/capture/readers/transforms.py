@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
-from graings.capture.capture import SPLITS, Split
+from graings.capture.capture import ALL_SPLITS, SPLITS, Split
 from graings.capture.folder import CaptureFolder
 from graings.capture.raw_capture import RawCapture, RawFrame
 from graings.capture.readers.json_document import parse_json
@@ -50,21 +50,21 @@ class Transforms(Intrinsics):
 
     def listed(self, split: Split) -> list[str] | None:
         """The images that the file names for `split`, or None where it does not."""
-        return {"train": self.train_filenames, "val": self.val_filenames, "test": self.test_filenames}[split]
+        return {"train": self.train_filenames, "val": self.val_filenames, "test": self.test_filenames}.get(split)
 
 
 _TRANSFORMS: Final = TypeAdapter(Transforms)
 
 
 def read_transforms(folder: CaptureFolder, config: CaptureConfig) -> RawCapture:
-    """Everything `transforms_{train,val,test}.json` say. Raises `CaptureError` naming file and field."""
-    splits: dict[Split, tuple[RawFrame, ...]] = {split: _read_split(folder, split, config) for split in SPLITS}
+    """Everything `transforms_{train,val,test,between}.json` say. Raises `CaptureError` naming file and field."""
+    splits: dict[Split, tuple[RawFrame, ...]] = {split: _read_split(folder, split, config) for split in ALL_SPLITS}
     if not splits["train"]:
         raise CaptureError("has no frames", file=_file("train"), field="frames", remedy="List at least one image.")
     _check_times({_file(split): shots for split, shots in splits.items()})
     notes = _lens_notes(shot for shots in splits.values() for shot in shots)
     trained = {shot.image.name for shot in splits["train"]}
-    for split in SPLITS[1:]:
+    for split in ALL_SPLITS[1:]:
         shared = sum(shot.image.name in trained for shot in splits[split])
         if shared:
             notes.append(f"{shared} of {len(splits[split])} {split} images are training images too")
