@@ -175,7 +175,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=400)
     parser.add_argument("--views", type=int, default=150)
     parser.add_argument("--train", nargs="+", metavar="PRESET", default=[])
-    parser.add_argument("--set", nargs="+", metavar="OPTION=VALUE", default=[], help="for training")
+    parser.add_argument("--set", nargs="+", action="extend", metavar="OPTION=VALUE", default=[], help="for training")
     parser.add_argument("--sheet", type=Path)
     arguments = parser.parse_args()
     if arguments.sheet is not None:
