@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +14,7 @@ from rich.text import Text
 from graings.capture.synthetic import SUITE
 from graings.capture.synthetic import synthesize as write_scene
 from graings.cli.terminal import say
+from graings.kernel.threads import usable_cores
 
 
 def synthesize(
@@ -48,7 +48,7 @@ def synthesize(
                 size=size,
                 views=views,
                 seed=seed,
-                processes=processes or len(os.sched_getaffinity(0)),
+                processes=processes or usable_cores(),
                 observe=lambda done, total: bar.update(task, completed=done, total=total),
             )
         except ValueError as error:

@@ -16,7 +16,7 @@ REACH, HAND, TOP = 0.5, -0.35, 0.95
 
 
 def _thrown(start: float) -> Callable[[float], Pose]:
-    """A ball that flies from hand to hand and back, each time on a parabola."""
+    """A ball thrown from hand to hand and back, each time on a parabola."""
 
     def pose(time: float) -> Pose:
         phase = 2.0 * time + start
