@@ -58,8 +58,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
-        *("graings.ablation", "graings.camera", "graings.config", "graings.evaluation", "graings.kernel"),
-        *("graings.render", "graings.report", "graings.storage", "graings.training"),
+        *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
+        *("graings.kernel", "graings.render", "graings.report", "graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
     "jobs": (
@@ -81,10 +81,13 @@ HOMES: dict[str, tuple[str, ...]] = {
     "starlette": ("service",),
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
-    "typer": ("graings.cli.main", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
+    "typer": (
+        *("graings.cli.main", "graings.cli.option_table", "graings.cli.synthesize", "graings.cli.training"),
+        *("jobs.commands", "service.commands", "service.demo"),
+    ),
     "rich": (
-        *("graings.cli.main", "graings.cli.training", "graings.cli.progress", "graings.cli.terminal", "jobs.commands"),
-        *("service.commands", "service.demo"),
+        *("graings.cli.main", "graings.cli.option_table", "graings.cli.progress", "graings.cli.synthesize"),
+        *("graings.cli.terminal", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
     ),
     "OpenImageIO": ("graings.capture", "graings.image_encoding"),
     "pycolmap": ("graings.capture", "graings.training.initialization"),

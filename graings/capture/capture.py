@@ -17,8 +17,10 @@ from graings.camera.camera import Camera, View
 from graings.camera.units import Units
 from graings.capture.lens import Lens
 
-Split = Literal["train", "val", "test"]
+Split = Literal["train", "val", "test", "between"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
+# Beside the usual splits some captures hold images at times between those of training.
+ALL_SPLITS: tuple[Split, ...] = (*SPLITS, "between")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,12 +59,13 @@ class Capture:
     units: Units
     has_alpha: bool  # some image carries an alpha channel
     points: PointCloud | None = None
+    between: tuple[Frame, ...] = ()  # held out like val and test, at times between training times
     notes: tuple[str, ...] = field(default=())  # what the reader skipped or assumed, as sentences
     content_hash: str = ""  # sha256 over the files that were read, independent of the folder's path
 
     def split(self, name: Split) -> tuple[Frame, ...]:
         """Frames of one split."""
-        return {"train": self.train, "val": self.val, "test": self.test}[name]
+        return {"train": self.train, "val": self.val, "test": self.test, "between": self.between}[name]
 
     def __iter__(self) -> Iterator[tuple[Split, Frame]]:
         for name in SPLITS:

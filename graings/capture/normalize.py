@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
 from graings.camera.units import Units
-from graings.capture.capture import SPLITS, Capture, Frame, PointCloud
+from graings.capture.capture import ALL_SPLITS, Capture, Frame, PointCloud
 from graings.capture.raw_capture import MAX_MAGNITUDE, RawCapture, RawFrame
 from graings.errors import CaptureError
 
@@ -46,7 +46,7 @@ def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash
     Raises `CaptureError` naming the image whose camera or time has an impossible value.
     """
     notes = list(raw.notes)
-    raw_frames = [raw_frame for split in SPLITS for raw_frame in raw.splits[split]]
+    raw_frames = [raw_frame for split in ALL_SPLITS for raw_frame in raw.splits.get(split, ())]
     for raw_frame in raw_frames:
         position, time = np.abs(raw_frame.camera.center).max(), abs(raw_frame.time or 0.0)
         for field, magnitude in (("camera position", position), ("time", time)):
@@ -95,7 +95,7 @@ def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash
             lens=raw_frame.lens,
         )
 
-    splits = {split: tuple(normalized(raw_frame) for raw_frame in raw.splits[split]) for split in SPLITS}
+    splits = {split: tuple(normalized(raw_frame) for raw_frame in raw.splits.get(split, ())) for split in ALL_SPLITS}
     points = None
     if raw.positions is not None and raw.colors is not None:
         points = PointCloud(units.points(raw.positions), raw.colors)
@@ -105,6 +105,7 @@ def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash
         train=splits["train"],
         val=splits["val"],
         test=splits["test"],
+        between=splits["between"],
         units=units,
         has_alpha=any(raw_frame.image.has_alpha for raw_frame in raw_frames),
         points=points,

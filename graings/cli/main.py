@@ -9,30 +9,30 @@ from __future__ import annotations
 import errno
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any, Final, Literal, NoReturn, get_args
+from typing import Annotated, Any, Final, Literal, NoReturn
 
 import typer
 import typer.core
-from annotated_types import Ge, Gt, Le, Lt  # pydantic depends on it
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.camera.viewpoint import background_rgb
-from graings.cli.terminal import metrics_line, print_line
+from graings.cli.option_table import show_options
+from graings.cli.synthesize import synthesize
+from graings.cli.terminal import metrics_line, motion_line, print_line
 from graings.cli.training import MultiValueCommand, Threads, ablate, train
-from graings.config import ConfigSection, make_config, options
 from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
 from graings.image_encoding import encode_image, image_format
 from graings.kernel import use_threads
 from graings.render import render
 from graings.report.evaluate_run import evaluate_run
 from graings.report.folder import report_runs
+from graings.report.metrics_document import METRICS_FILE, read_metrics
 from graings.report.work_precision import summary
 from graings.storage.compact import SUFFIX, open_model, write_compact
 from graings.storage.model import scene_bytes
@@ -89,7 +89,9 @@ def graings() -> None:
 
 
 app.command()(train)
+app.command()(synthesize)
 app.command(cls=MultiValueCommand)(ablate)
+app.command(name="options")(show_options)
 
 
 @app.command(name="render")
@@ -165,7 +167,7 @@ def export(
 @app.command()
 def evaluate(
     run: RunFolder,
-    split: Annotated[Literal["val", "test"], typer.Option(help="Held-out views to evaluate.")] = "val",
+    split: Annotated[Literal["val", "test", "between"], typer.Option(help="Held-out views to evaluate.")] = "val",
     capture: Annotated[Path | None, typer.Option(help="Folder of the capture, if it was moved since training.")] = None,
     background: Annotated[
         str | None, typer.Option(help="white, black, #rrggbb or r,g,b instead of that of training; prints only.")
@@ -180,6 +182,9 @@ def evaluate(
         raise typer.BadParameter(str(error), param_hint="--background") from error
     print_line(metrics_line(split, evaluate_run(run, split, capture, rgb)))
     if rgb is None:
+        motion = read_metrics(run / METRICS_FILE).motion
+        if motion is not None:
+            print_line(motion_line(motion))
         print_line(f"Written to {run / 'metrics.json'}.")
     else:
         print_line(f"On {background}; metrics.json still has the metrics on the background of training.")
@@ -207,22 +212,6 @@ def report(
     for note in written.notes:
         print_line(note)
     print_line(f"Written to {written.folder}: {', '.join(written.files)}.")
-
-
-@app.command(name="options")
-def show_options(
-    preset: Annotated[str, typer.Option(help="Show the values of this preset.")] = "standard",
-    as_json: Annotated[bool, typer.Option("--json", help="JSON schema and presets instead of a table.")] = False,
-) -> None:
-    """List every option of --set."""
-    console = Console()
-    if as_json:
-        console.print_json(json.dumps(options()))
-        return
-    table = Table("option", "value", "bounds", "", box=None, pad_edge=False, header_style="bold")
-    for name, value, bounds, text in _fields(make_config(preset)):
-        table.add_row(Text(name), Text(value, style="cyan"), Text(bounds, style="dim"), Text(text))
-    console.print(table)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -271,33 +260,6 @@ def _read_pose(file: Path) -> dict[str, object]:
     if not isinstance(pose, dict):
         raise ValueError(f"{file}: must be a JSON object with world_to_camera, fx, width and height")
     return pose
-
-
-def _fields(part: ConfigSection, prefix: str = "") -> Iterator[tuple[str, str, str, str]]:
-    """Name, value, bounds and help of every option below `part`."""
-    for name, field in type(part).model_fields.items():
-        value = getattr(part, name)
-        if isinstance(value, ConfigSection):
-            yield from _fields(value, f"{prefix}{name}.")
-            continue
-        # Bounds of the value itself, or of each item of a list.
-        items = [info for item in get_args(field.annotation)[:1] for info in getattr(item, "__metadata__", ())]
-        metadata = [*field.metadata, *(constraint for info in items for constraint in info.metadata)]
-        bounds = [text for constraint in metadata if (text := _bound(constraint))]
-        yield f"{prefix}{name}", json.dumps(value), ", ".join(bounds), field.description or ""
-
-
-def _bound(constraint: object) -> str:
-    match constraint:
-        case Ge(ge=limit):
-            return f"≥ {limit}"
-        case Gt(gt=limit):
-            return f"> {limit}"
-        case Le(le=limit):
-            return f"≤ {limit}"
-        case Lt(lt=limit):
-            return f"< {limit}"
-    return ""
 
 
 def _fail(text: str, code: int) -> NoReturn:

@@ -7,6 +7,7 @@ from rich.status import Status
 from rich.text import Text
 
 from graings.evaluation.metrics import SplitMetrics
+from graings.evaluation.motion import MotionMetrics
 
 
 def print_line(text: str) -> None:
@@ -26,3 +27,11 @@ def metrics_line(split: str, metrics: SplitMetrics) -> str:
     lpips = metrics.lpips_vgg
     rest = f"LPIPS {lpips:.4f}" if lpips is not None else f"no LPIPS: {metrics.lpips_reason}"
     return f"{split}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim_3dgs:.4f}, {len(metrics.views)} views; {rest}"
+
+
+def motion_line(motion: MotionMetrics) -> str:
+    """The error of tracked points as one line."""
+    return (
+        f"motion: {motion.points} points at {motion.times} times, off by {motion.mean:.2%} of the extent on average, "
+        f"90 % of them by less than {motion.percentile_90:.2%} (without any motion {motion.mean_at_rest:.2%})"
+    )

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from graings.capture.capture import Split
+from graings.capture.capture import Capture, Split
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
+from graings.capture.trajectories import read_trajectories
 from graings.errors import CheckpointError
 from graings.evaluation.evaluate import evaluate
 from graings.evaluation.metrics import Lpips, SplitMetrics
+from graings.evaluation.motion import MotionMetrics, measure_motion
 from graings.report.metrics_document import METRICS_FILE, read_metrics
 from graings.report.run_record import read_record
 from graings.storage.compact import open_model
 from graings.storage.files import write_document
+from graings.storage.model import Model
 
 
 def evaluate_run(
@@ -24,7 +27,8 @@ def evaluate_run(
 
     The capture is read from where it was during training unless `capture` names another place. With a `background` [3]
     other than that of training nothing is written: such metrics only tell whether opaque objects are opaque and empty
-    space is empty. Raises `CheckpointError` when the run has no model or the capture is not the one it was trained on.
+    space is empty. Of a capture with `trajectories.json` the error of tracked points is written too. Raises
+    `CheckpointError` when the run has no model or the capture is not the one it was trained on.
     """
     model = open_model(run)
     record = read_record(run)
@@ -40,6 +44,16 @@ def evaluate_run(
     if background is not None:
         return metrics
     document = read_metrics(run / METRICS_FILE)
-    splits = {**document.splits, split: metrics}
-    write_document(run / METRICS_FILE, document.model_copy(update={"splits": splits}))
+    update = {"splits": {**document.splits, split: metrics}, "motion": _motion(model, data)}
+    write_document(run / METRICS_FILE, document.model_copy(update=update))
     return metrics
+
+
+def _motion(model: Model, capture: Capture) -> MotionMetrics | None:
+    """The error of tracked points; None where the capture has no trajectories."""
+    trajectories = read_trajectories(capture.root)
+    if trajectories is None:
+        return None
+    times = [capture.units.time(time) for time in trajectories.times]
+    eye = capture.train[0].camera.center
+    return measure_motion(model.scene, eye, times, capture.units.points(trajectories.array()))

@@ -13,6 +13,7 @@ from graings.capture.capture import Split
 from graings.config import TrainConfig
 from graings.document import Document, read_document
 from graings.evaluation.metrics import PSNR_CAP, SplitMetrics
+from graings.evaluation.motion import MotionMetrics
 from graings.plan.plan import Plan
 from graings.report.events import Channel, Event
 from graings.report.machine import MachineFacts, VersionFacts
@@ -107,6 +108,9 @@ class Metrics(Document):
         "graings.metrics/1", alias="schema", description="Kind and version of this document."
     )
     splits: dict[Split, SplitMetrics] = Field(description="Metrics of whole splits; empty before the run has ended.")
+    motion: MotionMetrics | None = Field(
+        None, description="Error of tracked points; null unless the capture has trajectories and was evaluated."
+    )
     train_s: Seconds = Field(description="Wall-clock seconds of training alone: no evaluation, checkpoint or loading.")
     train_cpu_s: Seconds = Field(description="CPU seconds of all threads in `train_s`.")
     total_s: Seconds = Field(description="Sum of `phases_s`.")

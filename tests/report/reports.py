@@ -48,6 +48,7 @@ def values(*curve: EvaluationPoint, **changes: Any) -> dict[str, Any]:
                 "views": [{"name": "a", **VIEW}, {"name": "b", **VIEW}],
             }
         },
+        "motion": None,
         "train_s": 80.0,
         "train_cpu_s": 150.0,
         "total_s": 100.0,

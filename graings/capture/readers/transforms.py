@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
-from graings.capture.capture import SPLITS, Split
+from graings.capture.capture import ALL_SPLITS, SPLITS, Split
 from graings.capture.folder import CaptureFolder
 from graings.capture.raw_capture import RawCapture, RawFrame
 from graings.capture.readers.colmap_camera import undistortion_notes
@@ -50,15 +50,15 @@ class Transforms(Intrinsics):
 
     def listed(self, split: Split) -> list[str] | None:
         """The file names that the file lists for `split`, or None without a list."""
-        return {"train": self.train_filenames, "val": self.val_filenames, "test": self.test_filenames}[split]
+        return {"train": self.train_filenames, "val": self.val_filenames, "test": self.test_filenames}.get(split)
 
 
 _TRANSFORMS: Final = TypeAdapter(Transforms)
 
 
 def read_transforms(folder: CaptureFolder, config: CaptureConfig) -> RawCapture:
-    """The frames of `transforms_{train,val,test}.json`. Raises `CaptureError` naming file and field."""
-    splits: dict[Split, tuple[RawFrame, ...]] = {split: _read_split(folder, split, config) for split in SPLITS}
+    """The frames of `transforms_{train,val,test,between}.json`. Raises `CaptureError` naming file and field."""
+    splits: dict[Split, tuple[RawFrame, ...]] = {split: _read_split(folder, split, config) for split in ALL_SPLITS}
     if not splits["train"]:
         raise CaptureError("has no frames", file=_file("train"), field="frames", remedy="List at least one image.")
     _check_times({_file(split): frames for split, frames in splits.items()})
@@ -166,7 +166,11 @@ def _listed_splits(
 def _overlap_notes(splits: dict[Split, tuple[RawFrame, ...]]) -> list[str]:
     """A note for each held-out split that shares images with the training split."""
     trained = {frame.image.name for frame in splits["train"]}
-    counts = {split: sum(frame.image.name in trained for frame in splits[split]) for split in SPLITS[1:]}
+    counts = {
+        split: sum(frame.image.name in trained for frame in frames)
+        for split, frames in splits.items()
+        if split != "train"
+    }
     return [
         f"{count} of {len(splits[split])} {split} images are also training images"
         for split, count in counts.items()
