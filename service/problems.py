@@ -138,7 +138,9 @@ def install(app: FastAPI) -> None:
     async def known(request: Request, error: Exception) -> Response:
         status, kind = next((status, kind) for cls, status, kind in STATUSES if isinstance(error, cls))
         if status >= 500 and status != 503:
-            LOG.error("%s %s: %s", request.method, request.url.path, error)
+            # A file name may contain lone surrogates, which a log in UTF-8 cannot.
+            message = str(error).encode("utf-8", "backslashreplace").decode()
+            LOG.error("%s %s: %s", request.method, request.url.path, message)
         headers = error.headers if isinstance(error, ServiceError) else None
         if status == 503 and headers is None:
             headers = RETRY_LATER

@@ -69,9 +69,12 @@ def test_the_frameworks_own_errors_are_problem_documents(client: TestClient) -> 
     problem(client.get("/web/none.js"), 404)
 
 
-def test_a_lone_surrogate_in_a_request_can_be_quoted(client: TestClient) -> None:
+def test_a_lone_surrogate_in_a_request_can_be_quoted_and_logged(
+    client: TestClient, caplog: pytest.LogCaptureFixture
+) -> None:
     """JSON can contain it, UTF-8 cannot."""
     document = problem(raising(GraingsError("cannot read a\ud800b")).get("/"), 500)
     assert document["detail"] == "cannot read a?b"
+    assert b"cannot read a\\ud800b" in caplog.text.encode("utf-8")
     document = problem(client.post("/jobs", params={"config": '{"\\ud800": 1}'}), 422)
     assert document["type"] == "urn:graings:problem:bad-config"
