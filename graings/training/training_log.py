@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from graings.capture.capture import SPLITS, Capture, Split
 from graings.config import TrainConfig
@@ -42,6 +42,9 @@ from graings.training.guard.guard import Guard
 from graings.training.guard.stiffness import Stiffness
 from graings.training.timing import Clock
 
+# While a run trains, its plots are drawn again only after they took less than this share of the training time.
+MAX_PLOTTING_SHARE: Final = 0.02
+
 
 class LogState(Document):
     """What a checkpoint keeps of the log."""
@@ -71,6 +74,7 @@ class TrainingLog:
         self.events: list[Event] = []
         self.gaussians = 0
         self.diverged: str | None = None
+        self._plotting_s = 0.0
 
     def note(self, events: Iterable[Event]) -> None:
         """Keep what happened."""
@@ -146,10 +150,10 @@ class TrainingLog:
         compact: CompactFacts | None = None,
         stiffness: Stiffness | None = None,
     ) -> None:
-        """Write metrics.json, curve.svg and report/ as of `iteration`.
+        """Write metrics.json as of `iteration`, and curve.svg and report/ unless they would take too much time.
 
         `splits` are the metrics of whole splits and `stiffness` is measured over all training views; these two and
-        `compact` only exist once the run has ended.
+        `compact` only exist once the run has ended. Then the plots are always drawn.
         """
         started = time.perf_counter()
         metrics = Metrics(
@@ -182,11 +186,16 @@ class TrainingLog:
             hashes=Hashes(config=config_hash(self.config), capture=self.capture.content_hash),
         )
         write_document(self.folder / METRICS_FILE, metrics)
-        write_text(
-            self.folder / "curve.svg", svg(curve_figure([point.model_dump(mode="json") for point in self.curve]))
-        )
-        report_training(run_names([self.folder])[0], metrics, self.config, self.folder / "report")
+        if stiffness is not None or self._plotting_s <= MAX_PLOTTING_SHARE * self.clock.train_s():
+            self._write_plots(metrics)
         self.clock.add("report", time.perf_counter() - started)
+
+    def _write_plots(self, metrics: Metrics) -> None:
+        started = time.perf_counter()
+        curve = curve_figure([point.model_dump(mode="json") for point in metrics.curve])
+        write_text(self.folder / "curve.svg", svg(curve))
+        report_training(run_names([self.folder])[0], metrics, self.config, self.folder / "report")
+        self._plotting_s += time.perf_counter() - started
 
     def _capture_facts(self, background: Sequence[float]) -> CaptureFacts:
         camera = self.capture.train[0].camera

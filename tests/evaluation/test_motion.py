@@ -62,7 +62,7 @@ def test_errors_are_in_units_of_the_box_around_all_positions() -> None:
 
 def test_an_untrained_scene_stands_still() -> None:
     truth = np.stack([turned(cloud(40), time) for time in TIMES])
-    metrics = measure_motion(tiny_scene(awake=False), EYE, TIMES, truth)
+    metrics = measure_motion(tiny_scene(trained=False), EYE, TIMES, truth)
     assert metrics is not None
     assert metrics.mean == pytest.approx(metrics.mean_at_rest, abs=1e-6)
     assert metrics.mean_at_rest > 0.05

@@ -46,7 +46,7 @@ def test_a_diverged_run_keeps_its_best_model_and_reports_the_reason(
     run = _diverged_run(micro, folder, monkeypatch)
     model, document = load_model(folder), _document(folder)
     assert (document["diverged"], document["rollbacks"]) == (True, 3)
-    assert "3 times: the loss was not finite" in document["diverged_reason"]
+    assert "3 rollbacks: the loss was not finite" in document["diverged_reason"]
     assert document["iterations"] == model.iteration == run.iteration < DIVERGES_AT
     assert not model.finished
     assert all(bool(values.isfinite().all()) for values in model.scene.state_dict().values())
@@ -197,7 +197,7 @@ def test_a_crash_in_the_middle_of_a_checkpoint_leaves_the_one_before(
     def killed(path: Path) -> None:
         raise Killed
 
-    monkeypatch.setattr(checkpoint, "_flush", killed)
+    monkeypatch.setattr(checkpoint, "sync_tree", killed)
     with pytest.raises(Killed):
         run.save()
     monkeypatch.undo()

@@ -12,6 +12,7 @@ import torch
 from graings.camera.camera import Camera
 from graings.capture.images import shrink
 from graings.config import make_config
+from graings.report.events import RolledBack
 from graings.storage.compact import open_model
 from graings.training.curriculum import resolution_schedule as resolution
 from graings.training.curriculum.resolution_schedule import downscale_factor, downscaled
@@ -57,7 +58,7 @@ def test_a_downscaled_camera_has_the_same_field_of_view() -> None:
 @pytest.fixture
 def begins_small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The images of the micro capture are small already: let them be downscaled further."""
-    monkeypatch.setattr(resolution, "SMALLEST", 4)
+    monkeypatch.setattr(resolution, "MIN_SIDE", 4)
 
 
 def _trainer(micro: Path, **options: object) -> Trainer:
@@ -138,6 +139,8 @@ def test_a_rollback_to_a_lower_resolution_restores_neither_its_losses_nor_its_lo
     assert trainer.snapshots.newest.scene.sampling == trainer.pyramid.at(15).sampling
     with torch.no_grad():
         next(trainer.scene.parameters()).view(-1)[0] = float("nan")
-    assert trainer.check()[0].startswith("rolled back to iteration 15")
+    (event,) = trainer.check()
+    assert isinstance(event, RolledBack)
+    assert event.to_iteration == 15
     assert trainer.scene.sampling == trainer.pyramid.at(22).sampling != trainer.pyramid.at(15).sampling
     assert trainer.guard.trend.mean is None

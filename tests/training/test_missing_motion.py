@@ -168,7 +168,6 @@ def test_a_restart_has_its_own_time_window() -> None:
     assert RestartState().config(config) is config
     other = RestartState(400, 0.25).config(config)
     assert (other.iterations, other.time_window) == (ITERATIONS, 0.25)
-    assert RestartState.of({}) == RestartState()
 
 
 def test_the_narrowest_window_with_enough_views_is_chosen() -> None:

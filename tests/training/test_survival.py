@@ -144,7 +144,7 @@ def test_repeated_rollbacks_go_further_back_and_end_in_divergence(micro: Path, m
     steps(trainer, 60)
     spoil_loss(monkeypatch, trainer, lambda i: i > 60)
     reports = [trainer.step() for _ in range(11)]
-    with pytest.raises(DivergedError, match="after going back 3 times: the loss was not finite"):
+    with pytest.raises(DivergedError, match="after 3 rollbacks: the loss was not finite"):
         trainer.step()
     assert [event.to_iteration for event in events_of(reports, "rolled_back")] == [50, 25, 25]
     assert trainer.iteration == 72
@@ -442,7 +442,7 @@ def test_a_collapsed_scene_gets_its_opacity_raised_once_and_then_rolls_back(micr
     assert events_of(again, "opacity_reset") == []
     (event,) = events_of(again, "rolled_back")
     assert event.to_iteration == 125
-    assert event.reason.startswith("nothing was drawn any more")
+    assert event.reason.startswith("no Gaussian was drawn any more")
 
 
 def _noisy_rotations(capture: Path, count: int) -> Iterator[tuple[int, Tensor]]:

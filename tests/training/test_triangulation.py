@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 def _points(folder: Path) -> Array:
     capture = load_capture(folder)
     found = triangulate(capture.train, ImageStore((1.0, 1.0, 1.0)))
-    assert len(found.fill_untextured) == 0 or len(found.points) > 0
+    assert len(found.filled) == 0 or len(found.points) > 0
     return capture.units.points_back(found.points)
 
 
