@@ -19,7 +19,7 @@ from graings.capture.synthetic.shading import shade
 from graings.capture.synthetic.viewpoint import Viewpoint
 from graings.capture.synthetic.world import Instant, World
 
-RAYS_AT_ONCE: Final = 1 << 16  # a few tens of megabytes
+RAYS_AT_ONCE: Final = 1 << 18  # about a hundred megabytes
 # Positions of rays in a pixel: no two in one row, column or main diagonal, so that edges of all directions are sampled
 # finely. Eight at silhouettes, four where only colours differ.
 _QUEENS: Final = (0, 4, 7, 5, 2, 6, 1, 3)

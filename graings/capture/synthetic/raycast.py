@@ -23,6 +23,7 @@ SHADOW_STEPS: Final = 40
 SHADOW_START: Final = 0.012  # distance from a surface at which its own shadow ray begins
 OCCLUSION_HEIGHTS: Final = (0.06, 0.18)
 THIN: Final = 0.05  # parts of less than this width take no ambient light away
+THREAD: Final = 0.025  # and of less than this cast no shadow: their penumbra is many times as wide
 OCCLUSION: Final = 0.45  # how much of the ambient light one touching part takes away
 
 
@@ -83,6 +84,12 @@ def _near(
     useful = (middle[rays] - reach < limit[rays]) & (middle[rays] + reach > 0.0)
     rays, reach = rays[useful], reach[useful]
     return rays, np.minimum(middle[rays] + reach, limit[rays])
+
+
+def _width(placed: Placed) -> float:
+    """The least side of the part's box."""
+    low, high = placed.part.shape.box(placed.time)
+    return min(high[axis] - low[axis] for axis in range(3))
 
 
 def _furthest(placed: Placed, origins: Array) -> float:
@@ -152,7 +159,7 @@ def lit_share(instant: Instant, points: Array, normals: Array, parts: NDArray[np
     share = np.ones(points.shape[1])
     for index, placed in enumerate(instant.parts):
         shape = placed.part.shape
-        if isinstance(shape, Room):
+        if isinstance(shape, Room) or _width(placed) < THREAD:
             continue
         to_center = np.array(placed.center)[:, None] - raised
         middle = dot(to_center, light)
@@ -201,8 +208,7 @@ def open_share(instant: Instant, points: Array, normals: Array, parts: NDArray[n
     top = OCCLUSION_HEIGHTS[-1]
     for index, placed in enumerate(instant.parts):
         shape = placed.part.shape
-        low, high = shape.box(placed.time)
-        if min(high[axis] - low[axis] for axis in range(3)) < THIN:
+        if _width(placed) < THIN:
             continue
         offset = points - np.array(placed.center)[:, None]
         limit = placed.radius + top
