@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from graings.raster.photometric import photometric
 from graings.render import low_pass
 from graings.report.evaluate_run import evaluate_run
 from graings.report.machine import version_facts
+from graings.report.metrics_document import read_metrics
 from graings.storage.checkpoint import load_model, newest_checkpoint
 from graings.storage.compact import open_model
 from graings.training.held_out import HeldOut
@@ -57,6 +59,14 @@ def _config(**overrides: object) -> TrainConfig:
         "evaluation.checkpoint_every": 37,
     }
     return make_config("draft", small | overrides)
+
+
+@pytest.fixture(scope="module")
+def unbroken(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of `_config()` with one thread; tests that change it take a copy."""
+    folder = tmp_path_factory.mktemp("unbroken") / "run"
+    list(TrainingRun.create(capture, folder, _config()))
+    return folder
 
 
 def _tensors(run: Path) -> dict[str, torch.Tensor]:
@@ -153,30 +163,35 @@ def test_two_processes_do_not_train_in_one_folder(capture: Path, tmp_path: Path)
     assert next(iter(TrainingRun.resume(tmp_path / "run"))).iteration == 2
 
 
-def test_any_number_of_threads_trains_the_same_model(capture: Path, tmp_path: Path) -> None:
-    for threads in (1, 3):
-        list(TrainingRun.create(capture, tmp_path / str(threads), _config(threads=threads)))
-    one, many = _tensors(tmp_path / "1"), _tensors(tmp_path / "3")
+def test_any_number_of_threads_trains_the_same_model(capture: Path, unbroken: Path, tmp_path: Path) -> None:
+    list(TrainingRun.create(capture, tmp_path / "run", _config(threads=3)))
+    one, many = _tensors(unbroken), _tensors(tmp_path / "run")
     assert all(torch.equal(one[name], many[name]) for name in one)
 
 
-def test_a_run_resumed_from_any_checkpoint_equals_the_unbroken_run_bit_for_bit(capture: Path, tmp_path: Path) -> None:
-    unbroken = TrainingRun.create(capture, tmp_path / "unbroken", _config())
-    kinds = {event.kind for report in unbroken for event in report.events}
-    assert {"grew", "pruned"} <= kinds
-    expected = _tensors(tmp_path / "unbroken")
-    for stop in (5, 23, 41, 53):
-        folder = tmp_path / f"stopped_{stop}"
-        broken = TrainingRun.create(capture, folder, _config())
-        for report in broken:
-            if report.iteration == stop:
-                break
-        broken.save()
-        list(TrainingRun.resume(folder, threads=1))
-        resumed = _tensors(folder)
-        assert resumed.keys() == expected.keys()
-        for name, tensor in expected.items():
-            assert torch.equal(resumed[name], tensor), f"{name} after a stop at {stop}"
+@pytest.mark.parametrize(
+    "stop",
+    [
+        pytest.param(5, marks=pytest.mark.slow(reason="60 steps more; 23 and 41 are before and after growth")),
+        23,
+        41,
+        pytest.param(53, marks=pytest.mark.slow(reason="60 steps more; 23 and 41 are before and after growth")),
+    ],
+)
+def test_a_run_resumed_from_any_checkpoint_equals_the_unbroken_run_bit_for_bit(
+    capture: Path, unbroken: Path, tmp_path: Path, stop: int
+) -> None:
+    assert {"grew", "pruned"} <= {event.kind for event in read_metrics(unbroken / "metrics.json").events}
+    broken = TrainingRun.create(capture, tmp_path / "run", _config())
+    for report in broken:
+        if report.iteration == stop:
+            break
+    broken.save()
+    list(TrainingRun.resume(tmp_path / "run", threads=1))
+    expected, resumed = _tensors(unbroken), _tensors(tmp_path / "run")
+    assert resumed.keys() == expected.keys()
+    for name, tensor in expected.items():
+        assert torch.equal(resumed[name], tensor), name
 
 
 def test_resuming_without_a_checkpoint_starts_over(capture: Path, tmp_path: Path) -> None:
@@ -274,12 +289,10 @@ def test_a_disk_too_full_keeps_the_checkpoint_before_and_says_what_to_do(
 
 @pytest.mark.parametrize("file", ["scene.safetensors", "state.safetensors", "checkpoint.json"])
 def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(
-    capture: Path, tmp_path: Path, file: str, caplog: pytest.LogCaptureFixture
+    unbroken: Path, tmp_path: Path, file: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = tmp_path / "run"
-    expected = tmp_path / "unbroken"
-    list(TrainingRun.create(capture, expected, _config()))
-    list(TrainingRun.create(capture, folder, _config()))
+    shutil.copytree(unbroken, folder)
     older, newest = sorted(one for one in (folder / "checkpoints").iterdir() if one.name.isdigit())
     (newest / file).write_bytes((newest / file).read_bytes()[:100])
     resumed = TrainingRun.resume(folder, threads=1)
@@ -288,7 +301,7 @@ def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(
     assert "damaged" in caplog.text or "not readable" in caplog.text
     assert file == "state.safetensors" or load_model(folder).iteration == int(older.name)
     list(resumed)  # what is written at the end takes the place of the damaged one
-    for name, tensor in _tensors(expected).items():
+    for name, tensor in _tensors(unbroken).items():
         assert torch.equal(tensor, _tensors(folder)[name]), name
 
 

@@ -92,7 +92,10 @@ def test_a_run_with_a_bad_loss_is_as_good_as_a_clean_one(
     assert quality(trainer) > clean - 0.5
 
 
-@pytest.mark.parametrize("moment", ["exp_avg", "exp_avg_sq"])
+@pytest.mark.parametrize(
+    "moment",
+    ["exp_avg", pytest.param("exp_avg_sq", marks=pytest.mark.slow(reason="400 steps more for the other moment"))],
+)
 def test_a_bad_moment_estimate_is_detected_and_training_rolls_back(micro: Path, moment: str) -> None:
     """E02, one number of Adam's state at step 52: it reaches the parameter, not the model that is kept.
 
@@ -203,6 +206,7 @@ def test_a_finite_spike_is_clipped_and_does_not_freeze_its_parameter(micro: Path
     assert min(ratios) >= 0.2
 
 
+@pytest.mark.slow(reason="300 steps; a spike in a vector has the test above")
 def test_a_finite_spike_does_not_stop_the_rest_of_its_matrix(micro: Path) -> None:
     """E03 where singular values are made equal: 1e10 in one entry; the next 200 updates of all other entries.
 
@@ -352,7 +356,7 @@ def test_single_and_double_precision_learn_alike(micro: Path) -> None:
     ("bias", "projected"),
     [
         (3.0, True),
-        (-3.0, False),
+        pytest.param(-3.0, False, marks=pytest.mark.slow(reason="230 steps more for the other combinations")),
         pytest.param(3.0, False, marks=pytest.mark.slow(reason="230 steps more for the other combinations")),
         pytest.param(-3.0, True, marks=pytest.mark.slow(reason="230 steps more for the other combinations")),
     ],
@@ -378,7 +382,13 @@ def _drive(trainer: Trainer, layer: nn.Module, bias: float) -> None:
         layer.bias.fill_(bias)
 
 
-@pytest.mark.parametrize(("bias", "ground"), [(20.0, "black"), (-20.0, "white")])
+@pytest.mark.parametrize(
+    ("bias", "ground"),
+    [
+        (20.0, "black"),
+        pytest.param(-20.0, "white", marks=pytest.mark.slow(reason="as many steps again for the other sign")),
+    ],
+)
 def test_saturated_colours_recover(micro: Path, bias: float, ground: str) -> None:
     """E10: logits at 20 give a gradient of exactly 0 where it is formed from the value.
 
