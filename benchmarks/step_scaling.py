@@ -25,7 +25,7 @@ from graings.training.parameter_average import ParameterAverage
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+FRACTIONS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 SIDES = (100, 200, 400, 800)
 
 
@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=40)
     options = parser.parse_args()
 
-    by_count = dict(milliseconds(trainer_of(options, share, None), options.steps) for share in SHARES)
+    by_count = dict(milliseconds(trainer_of(options, share, None), options.steps) for share in FRACTIONS)
     by_pixels: dict[int, dict[str, float]] = {}
     for side in SIDES:
         trainer = trainer_of(options, 1.0, side)

@@ -169,16 +169,16 @@ PIXELS = """
 import hashlib, sys
 from graings.capture.synthetic.catalogue import SUITE
 from graings.capture.synthetic.drawing import draw
-from graings.capture.synthetic.recording import shots
+from graings.capture.synthetic.planned_view import planned_views
 from graings.capture.synthetic.tracking import track
 total = hashlib.sha256()
 for scene in SUITE:
     world = scene.build(0)
-    for shot in shots(world, size=40, views=3, seed=0)["test"][1:]:
-        view = draw(world, shot.viewpoint, 0.37 * shot.time + 0.11)
+    for planned in planned_views(world, size=40, views=3, seed=0)["test"][1:]:
+        view = draw(world, planned.viewpoint, 0.37 * planned.time + 0.11)
         for array in (view.rgba, view.depth, view.moving):
             total.update(array.tobytes())
-        total.update(f"{shot} {shot.viewpoint.intrinsics()}".encode())
+        total.update(f"{planned} {planned.viewpoint.intrinsics()}".encode())
     total.update(track(world, 0, [0.0, 0.5, 1.0], 50).tobytes())
 print(total.hexdigest())
 """

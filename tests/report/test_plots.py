@@ -27,7 +27,7 @@ SWEEP = (
     *(("alpha_min", 1 / 64, 9.0, 5e-3), ("alpha_min", 1e-6, 14.0, 1e-5), ("transmittance_min", 0.0, 15.0, 1e-3)),
 )
 LONG_NAME = "ablation/of-a-capture/with-a-long-name/standard/seed-0"
-NOTHING = "no held-out view was evaluated"
+NO_POINTS = "no held-out view was evaluated"
 
 
 def curve(*decibels: float | None, first: int = 50, factor: float = 1.5) -> list[dict[str, Any]]:
@@ -124,8 +124,8 @@ def test_psnr_and_rmse_are_written_at_the_same_height() -> None:
 
 def test_evaluations_without_a_held_out_view_are_left_out() -> None:
     assert len(line(panels(curve_figure(curve(None, 25.0, 26.0)))[0], 0)) == 2
-    assert NOTHING in words(curve_figure(curve(None)))
-    assert NOTHING in words(curve_figure([]))
+    assert NO_POINTS in words(curve_figure(curve(None)))
+    assert NO_POINTS in words(curve_figure([]))
 
 
 def test_an_evaluation_at_zero_seconds_is_at_the_start_of_the_axis() -> None:
@@ -194,7 +194,7 @@ def test_phases_that_do_not_add_up_are_a_warning() -> None:
 
 
 def test_runs_without_an_evaluation_have_a_row_and_no_line() -> None:
-    assert NOTHING in words(training_figure([run("a")]))
+    assert NO_POINTS in words(training_figure([run("a")]))
     both = training_figure([run("a"), run("b", 20.0, 25.0)])
     assert [len(shape.get_xdata()) for shape in panels(both)[0].lines if len(shape.get_xdata()) > 1] == [2]
     assert {"a", "b"} <= set(words(both))

@@ -67,14 +67,14 @@ def full_exposure(time: float) -> float:
     return 1.0
 
 
-Recording = Literal["moving", "rig", "still"]
+CameraSetup = Literal["moving", "rig", "still"]
 
 
 @dataclass(frozen=True, slots=True)
 class World:
     """Everything that is drawn. `room` scenes are opaque; the others have straight alpha.
 
-    `recording`: one moving camera, fixed cameras that each see all instants, or a single instant.
+    `cameras`: one moving camera, fixed cameras that each see all instants, or a single instant.
     """
 
     parts: tuple[Part, ...]
@@ -82,7 +82,7 @@ class World:
     light: Callable[[float], Light] = constant_light
     exposure: Callable[[float], float] = full_exposure
     room: bool = False
-    recording: Recording = "moving"
+    cameras: CameraSetup = "moving"
 
     def at(self, time: float) -> Instant:
         """The world at one time."""

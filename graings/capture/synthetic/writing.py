@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from graings.capture.synthetic.catalogue import scene_named
 from graings.capture.synthetic.drawing import draw
-from graings.capture.synthetic.recording import Shot, shots
+from graings.capture.synthetic.planned_view import PlannedView, planned_views
 from graings.capture.synthetic.tracking import track
 from graings.capture.trajectories import FILE
 from graings.errors import CaptureError
@@ -51,35 +51,35 @@ def synthesize(
     world = scene_named(name).build(seed)
     if folder.is_dir() and any(folder.iterdir()):
         raise CaptureError("is not empty", file=folder, remedy="Name another folder.")
-    splits = shots(world, size=size, views=views, seed=seed)
+    splits = planned_views(world, size=size, views=views, seed=seed)
     for split in splits:
         for parent in (folder, folder / "depth", folder / "moving"):
             (parent / split).mkdir(parents=True, exist_ok=True)
-    every = [shot for listed in splits.values() for shot in listed]
+    every = [view for listed in splits.values() for view in listed]
     for done, _ in enumerate(_written(name, seed, folder, every, processes), start=1):
         observe(done, len(every))
-    times = sorted({shot.time for shot in every})
+    times = sorted({view.time for view in every})
     positions = np.round(track(world, seed, times), 6) + 0.0
     (folder / FILE).write_text(json.dumps({"times": times, "positions": positions.tolist()}))
     for split, listed in splits.items():
-        document = listed[0].viewpoint.intrinsics() | {"frames": [_entry(shot) for shot in listed]}
+        document = listed[0].viewpoint.intrinsics() | {"frames": [_entry(view) for view in listed]}
         (folder / f"transforms_{split}.json").write_text(json.dumps(document, indent=1))
     return folder
 
 
-def _entry(shot: Shot) -> dict[str, Any]:
-    return {"file_path": f"./{shot.name}", "time": shot.time, "transform_matrix": shot.viewpoint.transform()}
+def _entry(view: PlannedView) -> dict[str, Any]:
+    return {"file_path": f"./{view.name}", "time": view.time, "transform_matrix": view.viewpoint.transform()}
 
 
-def _written(name: str, seed: int, folder: Path, every: list[Shot], processes: int) -> Iterator[None]:
+def _written(name: str, seed: int, folder: Path, every: list[PlannedView], processes: int) -> Iterator[None]:
     if processes <= 1:
-        for shot in every:
-            write_shot(name, seed, folder, shot)
+        for view in every:
+            write_view(name, seed, folder, view)
             yield
         return
     # Spawned, not forked: the parent may hold threads of numerical libraries.
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(write_shot, name, seed, folder, shot) for shot in every]
+        waiting = [pool.submit(write_view, name, seed, folder, view) for view in every]
         try:
             for future in as_completed(waiting):
                 future.result()  # raises what the worker raised
@@ -88,14 +88,14 @@ def _written(name: str, seed: int, folder: Path, every: list[Shot], processes: i
             pool.shutdown(cancel_futures=True)
 
 
-def write_shot(name: str, seed: int, folder: Path, shot: Shot) -> None:
+def write_view(name: str, seed: int, folder: Path, planned: PlannedView) -> None:
     """Draw one image of a scene and write it with its depth and mask."""
     world = scene_named(name).build(seed)
-    view = draw(world, shot.viewpoint, shot.time)
+    view = draw(world, planned.viewpoint, planned.time)
     image = view.rgba[..., :3] if world.room else view.rgba
-    _write(folder / f"{shot.name}.png", np.ascontiguousarray(image))
-    _write(folder / "depth" / f"{shot.name}.exr", view.depth[..., None])
-    _write(folder / "moving" / f"{shot.name}.png", view.moving[..., None])
+    _write(folder / f"{planned.name}.png", np.ascontiguousarray(image))
+    _write(folder / "depth" / f"{planned.name}.exr", view.depth[..., None])
+    _write(folder / "moving" / f"{planned.name}.png", view.moving[..., None])
 
 
 def _write(path: Path, pixels: NDArray[np.uint8] | NDArray[np.float32]) -> None:

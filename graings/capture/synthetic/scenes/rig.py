@@ -63,4 +63,4 @@ def build(seed: int) -> World:
     for index, (low, high) in enumerate(colors):
         texture = Lattice(rgb(low), rgb(high), 0.3)
         parts.append(Part(Ball(0.2), texture, pose=_thrown(2.0 * index / 3.0), moves=True, gloss=0.3))
-    return World(tuple(parts), CameraPath(elevation=(0.02, 0.12), target=(0.0, 0.0, -0.05)), recording="rig")
+    return World(tuple(parts), CameraPath(elevation=(0.02, 0.12), target=(0.0, 0.0, -0.05)), cameras="rig")

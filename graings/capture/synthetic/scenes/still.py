@@ -44,5 +44,5 @@ def build(seed: int) -> World:
             ),
         ),
         CameraPath(elevation=(0.03, 0.16), target=(0.0, 0.0, -0.25), distance=3.6),
-        recording="still",
+        cameras="still",
     )
