@@ -45,7 +45,7 @@ def test_a_job_that_diverges_has_this_state_and_its_best_model_can_be_rendered(
         finally:
             worker.terminate()
     assert job["state"] == "diverged"
-    assert "after going back 3 times" in job["error"]
+    assert "after 3 rollbacks" in job["error"]
     assert (job["progress"]["phase"], job["attempts"]) == ("diverged", 1)
     assert "retry" in job["links"]
     metrics = json.loads(client.get(job["links"]["metrics"]).text, parse_constant=_refuse)
