@@ -36,9 +36,12 @@ def measure_motion(scene: Scene, eye: ArrayLike, times: Sequence[float], positio
 
     At the first time each point takes the nearest Gaussians that are drawn from `eye` [3]; at later times it moves as
     they do on average, weighted by opacity and nearness. What Gaussians are off the surface at the first time is so no
-    error of motion. Lengths are in normalised units, times in [0, 1]. None where no Gaussian is opaque enough.
+    error of motion. Lengths are in normalised units, times in [0, 1]. None where there is only one time, or no
+    Gaussian is opaque enough.
     """
     truth = np.asarray(positions, dtype=np.float64)
+    if len(truth) < 2:
+        return None
     with torch.inference_mode():
         composed = scene.compose(eye, times[0])
         opacities = composed.gaussians.opacities.double().numpy()
@@ -78,11 +81,10 @@ def follow(points: Array, means: Array, opacities: Array, displacements: Array) 
 
 
 def motion_error(followed: Array, truth: Array) -> MotionMetrics:
-    """Distances of `followed` [T, M, 3] from `truth` [T, M, 3], the first time left out where there are more."""
+    """Distances of `followed` [T, M, 3] from `truth` [T, M, 3], T at least 2; the first time is left out."""
     extent = max(float(np.linalg.norm(np.ptp(truth.reshape(-1, 3), axis=0))), 1e-12)
-    later = slice(1, None) if len(truth) > 1 else slice(None)
-    distances = np.linalg.norm(followed[later] - truth[later], axis=2) / extent
-    at_rest = np.linalg.norm(truth[:1] - truth[later], axis=2) / extent
+    distances = np.linalg.norm(followed[1:] - truth[1:], axis=2) / extent
+    at_rest = np.linalg.norm(truth[:1] - truth[1:], axis=2) / extent
     return MotionMetrics(
         mean=float(distances.mean()),
         percentile_90=float(np.percentile(distances, 90)),

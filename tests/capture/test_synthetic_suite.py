@@ -231,3 +231,15 @@ def test_a_wrong_request_is_refused(tmp_path: Path) -> None:
     (tmp_path / "full" / "file").touch()
     with pytest.raises(CaptureError, match="not empty"):
         synthesize("globe", tmp_path / "full")
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_an_interrupted_scene_leaves_nothing(tmp_path: Path, processes: int) -> None:
+    def interrupt(done: int, total: int) -> None:
+        assert total > 3
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        synthesize("still", tmp_path / "still", size=16, views=20, processes=processes, observe=interrupt)
+    assert list(tmp_path.iterdir()) == []
+    synthesize("still", tmp_path / "still", size=16, views=1)  # the same folder can be used

@@ -86,3 +86,7 @@ def test_a_static_scene_has_the_error_of_standing_still() -> None:
     metrics = measure_motion(tiny_scene(temporal=False), EYE, TIMES, truth)
     assert metrics is not None
     assert metrics.mean == pytest.approx(metrics.mean_at_rest, abs=1e-6)
+
+
+def test_one_time_has_no_motion_to_score() -> None:
+    assert measure_motion(tiny_scene(), EYE, TIMES[:1], cloud(40)[None]) is None

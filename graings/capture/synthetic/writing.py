@@ -11,8 +11,12 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-from collections.abc import Callable, Iterator
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +28,7 @@ from graings.capture.synthetic.catalogue import scene_named
 from graings.capture.synthetic.drawing import draw
 from graings.capture.synthetic.planned_view import PlannedView, planned_views
 from graings.capture.synthetic.tracking import track
+from graings.capture.synthetic.world import World
 from graings.capture.trajectories import FILE
 from graings.errors import CaptureError
 
@@ -42,9 +47,9 @@ def synthesize(
 ) -> Path:
     """Write the scene `name` into `folder`, which is returned; `observe` is called after each image.
 
-    Pixels, cameras and trajectories have the same bits on every machine and for every number of processes. The
-    transforms files come last: an interrupted folder does not load. Raises `ValueError` for an unknown name, a size or
-    a number of views below 1, and `CaptureError` for a folder that is not empty.
+    Pixels, cameras and trajectories have the same bits on every machine and for every number of processes. A call that
+    is interrupted or fails removes what it has written. Raises `ValueError` for an unknown name, a size or a number of
+    views below 1, and `CaptureError` for a folder that is not empty.
     """
     if size < 1 or views < 1:
         raise ValueError(f"size and views must be at least 1, got {size} and {views}")
@@ -52,26 +57,45 @@ def synthesize(
     if folder.is_dir() and any(folder.iterdir()):
         raise CaptureError("is not empty", file=folder, remedy="Name another folder.")
     splits = planned_views(world, size=size, views=views, seed=seed)
+    try:
+        _write_capture(world, name, folder, splits, seed, processes, observe)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return folder
+
+
+def _write_capture(
+    world: World,
+    name: str,
+    folder: Path,
+    splits: dict[str, list[PlannedView]],
+    seed: int,
+    processes: int,
+    observe: Observer,
+) -> None:
     for split in splits:
         for parent in (folder, folder / "depth", folder / "moving"):
             (parent / split).mkdir(parents=True, exist_ok=True)
     every = [view for listed in splits.values() for view in listed]
-    for done, _ in enumerate(_written(name, seed, folder, every, processes), start=1):
-        observe(done, len(every))
+    with closing(_written(name, seed, folder, every, processes)) as written:  # an interrupt waits for the processes
+        for done, _ in enumerate(written, start=1):
+            observe(done, len(every))
     times = sorted({view.time for view in every})
     positions = np.round(track(world, seed, times), 6) + 0.0
     (folder / FILE).write_text(json.dumps({"times": times, "positions": positions.tolist()}))
     for split, listed in splits.items():
         document = listed[0].viewpoint.intrinsics() | {"frames": [_entry(view) for view in listed]}
         (folder / f"transforms_{split}.json").write_text(json.dumps(document, indent=1))
-    return folder
 
 
 def _entry(view: PlannedView) -> dict[str, Any]:
     return {"file_path": f"./{view.name}", "time": view.time, "transform_matrix": view.viewpoint.transform()}
 
 
-def _written(name: str, seed: int, folder: Path, every: list[PlannedView], processes: int) -> Iterator[None]:
+def _written(
+    name: str, seed: int, folder: Path, every: list[PlannedView], processes: int
+) -> Generator[None, None, None]:
     if processes <= 1:
         for view in every:
             write_view(name, seed, folder, view)
@@ -79,13 +103,27 @@ def _written(name: str, seed: int, folder: Path, every: list[PlannedView], proce
         return
     # Spawned, not forked: the parent may hold threads of numerical libraries.
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        waiting = [pool.submit(write_view, name, seed, folder, view) for view in every]
+        with _interrupts_ignored():
+            waiting = [pool.submit(write_view, name, seed, folder, view) for view in every]
         try:
             for future in as_completed(waiting):
                 future.result()  # raises what the worker raised
                 yield
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Processes started meanwhile ignore Ctrl-C, which a terminal sends to them too; the parent ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def write_view(name: str, seed: int, folder: Path, planned: PlannedView) -> None:
