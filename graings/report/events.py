@@ -6,6 +6,7 @@ event wherever it is written. Programs decide by `kind`.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, computed_field, model_validator
@@ -28,8 +29,9 @@ class _Event(Document):
         """The event in plain words."""
         return self._words()
 
+    @abstractmethod
     def _words(self) -> str:
-        raise NotImplementedError
+        """The sentence of `message`."""
 
     @model_validator(mode="before")
     @classmethod
