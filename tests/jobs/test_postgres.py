@@ -8,6 +8,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -35,16 +36,14 @@ def _user() -> str | None:
 class Server:
     """A PostgreSQL server for the tests, which can be stopped and started again."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self) -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
         self.url = f"postgresql://grain@127.0.0.1:{self.port}/postgres"
         self._user = _user()
-        for parent in (folder, *folder.parents[:2]):
-            parent.chmod(0o755)
-        self._data = folder / "data"
-        self._data.mkdir(mode=0o700)
+        # pytest's folders are closed to other users, so the server's lies beside them.
+        self._data = Path(tempfile.mkdtemp(prefix="grain-postgres-"))
         shutil.chown(self._data, self._user)
         command = ["initdb", "-D", self._data, "-U", "grain", "-A", "trust", "-N"]
         subprocess.run(command, user=self._user, cwd=self._data, check=True)
@@ -61,6 +60,10 @@ class Server:
         self._process.send_signal(signal.SIGINT)  # fast shutdown
         self._process.wait()
 
+    def remove(self) -> None:
+        self.stop()
+        shutil.rmtree(self._data)
+
     @contextmanager
     def stopped(self) -> Iterator[None]:
         self.stop()
@@ -71,20 +74,20 @@ class Server:
 
 
 @contextmanager
-def serving(factory: pytest.TempPathFactory) -> Iterator[Server]:
+def serving() -> Iterator[Server]:
     """A server for as long as the context lasts; skips the test if PostgreSQL is not installed."""
     if shutil.which("initdb") is None or shutil.which("postgres") is None:
         pytest.skip("PostgreSQL is not installed")
-    server = Server(factory.mktemp("postgres"))
+    server = Server()
     try:
         yield server
     finally:
-        server.stop()
+        server.remove()
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory) as server:
+def server() -> Iterator[Server]:
+    with serving() as server:
         yield server
 
 

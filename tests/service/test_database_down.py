@@ -18,8 +18,8 @@ REQUESTS = 60  # more than the service has threads
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory) as server:
+def server() -> Iterator[Server]:
+    with serving() as server:
         yield server
 
 
