@@ -1,6 +1,6 @@
-"""The command `demo`: train a small synthetic scene over HTTP and fetch views of it.
+"""The command `demo`: train a synthetic moving scene over HTTP and fetch views of it.
 
-It starts the service and a worker as `graings serve --with-worker` does, writes the synthetic capture, submits it,
+It starts the service and a worker as `graings serve --with-worker` does, draws the synthetic capture, submits it,
 shows the progress of training, and fetches views and metrics. It uses the REST interface like any other client.
 """
 
@@ -27,15 +27,18 @@ from urllib.parse import urlencode
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from graings.capture.synthetic import write_synthetic
+from graings.capture.synthetic import synthesize
+from graings.kernel.threads import usable_cores
 from jobs.job import JobState
 
 # About a minute of training on two cores.
 PRESET = "draft"
-OPTIONS: dict[str, Any] = {"iterations": 800, "init.points": 4_000, "density.max_anchors": 800}
-CAPTURE: dict[str, int] = {"frames": 80, "size": 128, "bodies": 3}
+OPTIONS: dict[str, Any] = {"iterations": 800}
+SCENE = "walker"
+SIZE = 200
+VIEWS = 100
 
 TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
 VIEWPOINTS: dict[str, dict[str, object]] = {
@@ -104,13 +107,11 @@ def demo(
 
 def _train(api: Api, folder: Path, console: Console) -> str:
     """Submit the capture and wait for the end of the job; returns its id."""
-    capture = folder / "capture"
+    capture = folder / SCENE
     if not capture.exists():
-        part = folder / "capture.part"  # renamed when complete, so that a partial capture is not used
-        shutil.rmtree(part, ignore_errors=True)
-        write_synthetic(part, **CAPTURE).rename(capture)
-    console.print(f"Capture: {capture} ({CAPTURE['frames']} frames of {CAPTURE['size']} px)")
-    query = urlencode({"preset": PRESET, "name": "synthetic scene", "config": json.dumps(OPTIONS)})
+        _draw_capture(capture, console)
+    console.print(f"Capture: {capture} ({VIEWS} training images of {SIZE} px)")
+    query = urlencode({"preset": PRESET, "name": SCENE, "config": json.dumps(OPTIONS)})
     job = api.json(f"/jobs?{query}", _zipped(capture), "application/zip")
     console.print(f"Job:     {api.url}{job['links']['self']}")
     columns = (
@@ -134,6 +135,23 @@ def _train(api: Api, folder: Path, console: Console) -> str:
     if job["state"] != JobState.SUCCEEDED:
         raise DemoError(f"the job has {job['state']}: {job['error']}. Its log: {api.url}{job['links']['log']}")
     return str(job["id"])
+
+
+def _draw_capture(capture: Path, console: Console) -> None:
+    part = capture.with_suffix(".part")  # renamed when complete, so that a partial capture is not used
+    shutil.rmtree(part, ignore_errors=True)
+    columns = (TextColumn("    draw"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("draw", total=None)
+        synthesize(
+            SCENE,
+            part,
+            size=SIZE,
+            views=VIEWS,
+            processes=usable_cores(),
+            observe=lambda done, total: progress.update(bar, completed=done, total=total),
+        )
+    part.rename(capture)
 
 
 def _fetch(api: Api, job: str, folder: Path, console: Console) -> dict[str, Any]:

@@ -37,6 +37,23 @@ class JobPage(BaseModel):
     next: str | None = Field(description="Address of the next page; null on the last.")
 
 
+class SceneOption(BaseModel):
+    """A synthetic scene that `graings synthesize` writes as a capture."""
+
+    name: str = Field(description="The scene's name.")
+    question: str = Field(description="What the scene tests.")
+
+
+class OptionsResource(BaseModel):
+    """What a submitter can choose."""
+
+    options: dict[str, Any] = Field(
+        alias="schema", description="JSON Schema of every training option with default, bounds and description."
+    )
+    presets: dict[str, dict[str, Any]] = Field(description="All values of each preset.")
+    scenes: list[SceneOption] = Field(description="Synthetic scenes to try without a capture of one's own.")
+
+
 class Readiness(BaseModel):
     """Whether the service can take work."""
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from graings.capture.capture import SPLITS, Frame, Split
+from graings.capture.capture import ALL_SPLITS, Frame, Split
 from graings.capture.images import ImageStore
 from graings.errors import CheckpointError
 from graings.evaluation.evaluate import evaluate, subset
@@ -129,7 +129,7 @@ class RunOutput:
             state=TrainingState(tensors, {"trainer": facts, "restart": asdict(restart), **self.log.state()}),
             units=capture.units,
             background=trainer.background,
-            views={split: [frame.view() for frame in capture.split(split)] for split in SPLITS},
+            views={split: [frame.view() for frame in capture.split(split)] for split in ALL_SPLITS},
             config=self.log.config,
             iteration=iteration,
             finished=finished,

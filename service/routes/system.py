@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, Response
 
+from graings.capture.synthetic import SUITE
 from graings.config import options
 from service.context import ContextDep
 from service.problems import RESPONSES, RETRY_LATER, problem
-from service.schemas import Readiness
+from service.schemas import OptionsResource, Readiness
 
 WEB = Path(__file__).resolve().parent.parent / "web"
 PAGE_HEADERS = {
@@ -25,14 +25,15 @@ router = APIRouter(tags=["system"])
 
 
 @router.get("/options", operation_id="get_options")
-def all_options() -> dict[str, Any]:
-    """Every training option with default, bounds and description, and the presets."""
+def all_options() -> OptionsResource:
+    """Every training option with default, bounds and description, the presets, and the synthetic scenes."""
     return _options()
 
 
 @cache
-def _options() -> dict[str, Any]:
-    return options()
+def _options() -> OptionsResource:
+    scenes = [{"name": scene.name, "question": scene.question} for scene in SUITE]
+    return OptionsResource.model_validate({**options(), "scenes": scenes})
 
 
 @router.get("/healthz", operation_id="get_health")

@@ -7,7 +7,10 @@ from pathlib import Path
 import pytest
 
 from graings.capture.load import load_capture
+from graings.image_encoding import encode_image
+from graings.render import render
 from graings.report.metrics_document import METRICS_FILE, read_metrics
+from graings.storage.checkpoint import load_model
 from tests.cli.test_cli import TINY, graings
 
 
@@ -41,3 +44,13 @@ def test_a_synthetic_scene_is_written_trained_and_scored(tmp_path: Path, capsys:
     assert motion.points == 200
     assert motion.mean_at_rest > 0.01
     assert "motion: 200 points" in capsys.readouterr().out
+
+
+def test_a_view_of_the_split_between_can_be_rendered(tmp_path: Path) -> None:
+    capture, run, picture = tmp_path / "ring", tmp_path / "run", tmp_path / "view.png"
+    assert graings("synthesize", "ring", "-o", capture, "--size", 32, "--views", 10, "--processes", 1) == 0
+    assert graings("train", capture, "-o", run, *TINY, "--set", "iterations=10") == 0
+    assert graings("render", run, "--camera", "between:0", "-o", picture) == 0
+    frame, model = load_capture(capture).between[0], load_model(run)
+    expected = render(model.scene, frame.camera, frame.time, model.background).color
+    assert picture.read_bytes() == encode_image(expected)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
+from graings.capture.synthetic import SUITE
 from graings.config import TrainConfig
 from graings.errors import ConfigError
 from jobs.lease import FileLeases
@@ -19,6 +20,11 @@ def test_the_options_are_those_of_training(client: TestClient) -> None:
     document = client.get("/options").json()
     assert document["schema"]["properties"].keys() == TrainConfig.model_fields.keys()
     assert document["presets"]["paper"]["iterations"] == 30_000
+
+
+def test_the_options_name_the_synthetic_scenes(client: TestClient) -> None:
+    scenes = client.get("/options").json()["scenes"]
+    assert [(scene["name"], scene["question"]) for scene in scenes] == [(s.name, s.question) for s in SUITE]
 
 
 def test_health_and_readiness(client: TestClient, job: str, settings: Settings) -> None:
