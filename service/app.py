@@ -12,6 +12,7 @@ from fastapi.staticfiles import StaticFiles
 import graings
 from graings.kernel import use_threads
 from service import problems
+from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
 from service.routes import jobs, render, results, system
@@ -43,6 +44,7 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=lifespan,
     )
     app.add_middleware(BodyLimit, limit=limit)
+    app.add_middleware(Admission, path="/render", limit=settings.render_slots + settings.render_waiting)
     app.add_middleware(SameOrigin, allowed_hosts=settings.allowed_host_names)
     problems.install(app)
     for routes in (jobs, results, render, system):

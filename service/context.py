@@ -41,6 +41,7 @@ class Context:
         return shutil.disk_usage(self.store.root).free // MB
 
     def close(self) -> None:
+        self.pool.close()
         self.leases.close()
         self.engine.close()
 
@@ -58,8 +59,8 @@ def open_context(settings: Settings) -> Context:
         engine=engine,
         jobs=jobs,
         leases=open_leases(settings.database_url, store.workers),
-        models=ModelCache(settings.models),
-        pool=RenderPool(settings.render_slots, settings.render_waiting),
+        models=ModelCache(settings.models_mb * MB),
+        pool=RenderPool(settings.render_slots, settings.images_mb * MB),
     )
 
 

@@ -63,12 +63,6 @@ class NotAcceptable(ServiceError):
     """The service has no format that the client accepts."""
 
 
-class Busy(ServiceError):
-    """Too many requests wait already."""
-
-    headers: ClassVar[dict[str, str] | None] = {"Retry-After": "1"}
-
-
 # The first matching class counts.
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (JobNotFound, 404, "no-such-job"),
@@ -81,7 +75,6 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (NotYet, 404, "not-yet"),
     (NotAcceptable, 406, "not-acceptable"),
     (ClientDisconnect, 400, "disconnected"),
-    (Busy, 503, "busy"),
     (ConfigError, 422, "bad-config"),
     (CaptureError, 422, "bad-capture"),
     (CheckpointError, 500, "bad-checkpoint"),

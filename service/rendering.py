@@ -1,27 +1,27 @@
 """Rendering: loaded models, and a pool of threads that renders images of them.
 
-Models are identified by path and modification time; the least recently used one is discarded. If too many requests wait
-for a thread, further ones are refused at once.
+Models are identified by path and modification time. Models and images are kept until they exceed a number of bytes;
+the least recently used one is discarded first.
 """
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from anyio import CapacityLimiter, to_thread
 
 from graings.camera.camera import Camera
 from graings.errors import CheckpointError
 from graings.image_encoding import ImageFormat, encode_image
 from graings.render import render
 from graings.storage.compact import open_model
-from graings.storage.model import Model
+from graings.storage.model import Model, scene_bytes
 from graings.storage.run_folder import newest_model
-from service.problems import Busy
 
 _Key = tuple[str, int]
 
@@ -37,10 +37,10 @@ class RenderRequest:
 
 
 class ModelCache:
-    """At most `capacity` models in memory. `load` may be called from several threads."""
+    """Models in memory, at most `max_bytes` of them or one. `load` may be called from several threads."""
 
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
         self._loaded: OrderedDict[_Key, Model] = OrderedDict()
         self._guard = threading.Lock()
 
@@ -67,9 +67,12 @@ class ModelCache:
                     self._loaded[key] = model
             if key:
                 self._loaded.move_to_end(key)
-            while len(self._loaded) > self._capacity:
+            while len(self._loaded) > 1 and self._bytes() > self._max_bytes:
                 self._loaded.popitem(last=False)
             return model
+
+    def _bytes(self) -> int:
+        return sum(scene_bytes(model.scene) for model in self._loaded.values())
 
     def _discard(self, folder: Path) -> None:
         """Discard the older models of the same run."""
@@ -78,22 +81,47 @@ class ModelCache:
 
 
 class RenderPool:
-    """Renders images, `slots` at a time; at most `waiting` further requests may wait."""
+    """Renders images on `slots` threads. An image that is being rendered is not started again for another request.
 
-    def __init__(self, slots: int, waiting: int) -> None:
-        self._limiter = CapacityLimiter(slots)
-        self._max_requests = slots + waiting
-        self._requests = 0
+    The last images are kept, `kept_bytes` of them. Used on one event loop.
+    """
 
-    async def render(self, model: Model, request: RenderRequest) -> bytes:
-        """The encoded image. Raises `Busy`."""
-        if self._requests >= self._max_requests:
-            raise Busy("Too many images are being rendered. Try again in a moment.")
-        self._requests += 1
-        try:
-            return await to_thread.run_sync(_rendered, model, request, limiter=self._limiter)
-        finally:
-            self._requests -= 1
+    def __init__(self, slots: int, kept_bytes: int) -> None:
+        self._executor = ThreadPoolExecutor(slots, thread_name_prefix="render")
+        self._kept_bytes = kept_bytes
+        self._kept: OrderedDict[str, bytes] = OrderedDict()
+        self._running: dict[str, asyncio.Future[bytes]] = {}
+
+    @property
+    def running(self) -> int:
+        """Number of different images that are being rendered or wait for a thread."""
+        return len(self._running)
+
+    async def render(self, model: Model, request: RenderRequest, key: str) -> bytes:
+        """The encoded image; `key` identifies it with the model."""
+        kept = self._kept.get(key)
+        if kept is not None:
+            self._kept.move_to_end(key)
+            return kept
+        running = self._running.get(key)
+        if running is None:
+            running = asyncio.get_running_loop().run_in_executor(self._executor, _rendered, model, request)
+            self._running[key] = running
+            running.add_done_callback(lambda done: self._ended(key, done))
+        return await asyncio.shield(running)  # a client that goes away does not end it for the others
+
+    def close(self) -> None:
+        """End the threads; images that are not started yet are not rendered."""
+        self._executor.shutdown(cancel_futures=True)
+
+    def _ended(self, key: str, done: asyncio.Future[bytes]) -> None:
+        del self._running[key]
+        if done.cancelled() or done.exception() is not None:
+            return  # reported by those who wait
+        self._kept[key] = done.result()
+        size = sum(map(len, self._kept.values()))
+        while size > self._kept_bytes:
+            size -= len(self._kept.popitem(last=False)[1])
 
 
 def _rendered(model: Model, request: RenderRequest) -> bytes:

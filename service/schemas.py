@@ -11,8 +11,8 @@ from jobs.job import Job, JobState
 from jobs.progress import ProgressReport
 
 
-class JobResource(BaseModel):
-    """A training job."""
+class JobSummary(BaseModel):
+    """A training job as it is listed."""
 
     id: str = Field(description="Identifies the job in all addresses.")
     name: str = Field(description="Name given by its author.")
@@ -25,15 +25,20 @@ class JobResource(BaseModel):
     progress: ProgressReport | None = Field(description="The trainer's last report; null before the first.")
     checkpoint: int | None = Field(description="Iteration of the newest checkpoint, which `/render` shows.")
     error: str | None = Field(description="Why the job failed or diverged, with a remedy; null otherwise.")
+    links: dict[str, str] = Field(description="Addresses of what can be done with the job or read of it now.")
+
+
+class JobResource(JobSummary):
+    """A training job."""
+
     capture: str = Field(description="sha256 of the uploaded archive.")
     config: dict[str, Any] = Field(description="All options of the run; `GET /options` has their schema.")
-    links: dict[str, str] = Field(description="Addresses of what can be done with the job or read of it now.")
 
 
 class JobPage(BaseModel):
     """Some jobs, newest first."""
 
-    jobs: list[JobResource] = Field(description="The jobs of this page.")
+    jobs: list[JobSummary] = Field(description="The jobs of this page, without their options.")
     next: str | None = Field(description="Address of the next page; null on the last.")
 
 
@@ -65,6 +70,11 @@ class Readiness(BaseModel):
 
 def job_resource(job: Job) -> JobResource:
     """The resource of a job."""
+    return JobResource(**dict(job_summary(job)), capture=job.spec.capture, config=job.spec.config)
+
+
+def job_summary(job: Job) -> JobSummary:
+    """The entry of a job in a list."""
     base = f"/jobs/{job.id}"
     links = {"self": base, "events": f"{base}/events", "log": f"{base}/log"}
     if job.state in (JobState.QUEUED, JobState.RUNNING):
@@ -79,7 +89,7 @@ def job_resource(job: Job) -> JobResource:
         links |= {"metrics": f"{base}/metrics", "curve": f"{base}/curve.svg", "report": f"{base}/report"}
     if job.has_model:
         links["model"] = f"{base}/model"
-    return JobResource(
+    return JobSummary(
         id=job.id,
         name=job.spec.name,
         state=job.state,
@@ -91,8 +101,6 @@ def job_resource(job: Job) -> JobResource:
         progress=job.progress,
         checkpoint=job.checkpoint,
         error=job.error,
-        capture=job.spec.capture,
-        config=job.spec.config,
         links=links,
     )
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from graings.errors import ConfigError
+from graings.kernel.threads import usable_cores
 from jobs.commands import default_database
 
 PREFIX = "GRAINGS_"
@@ -32,10 +33,13 @@ class Settings(BaseModel):
     max_unpacked_mb: int = Field(16_384, ge=1, description="Largest capture after unpacking, in MB.")
     max_files: int = Field(20_000, ge=1, description="Greatest number of files in an archive.")
     min_free_mb: int = Field(512, ge=0, description="Free disk space, in MB, below which the service is not ready.")
-    models: int = Field(4, ge=1, le=256, description="Greatest number of models in memory.")
-    render_slots: int = Field(1, ge=1, le=64, description="Images rendered at the same time.")
+    models_mb: int = Field(256, ge=1, description="Memory for models, in MB; at least one is kept.")
+    images_mb: int = Field(32, ge=0, description="Memory for the last rendered images, in MB.")
+    render_slots: int = Field(
+        default_factory=usable_cores, ge=1, le=64, description="Images rendered at the same time (default: all cores)."
+    )
     render_waiting: int = Field(
-        16, ge=0, le=1_000, description="Requests that may wait for a slot; further ones get 503."
+        16, ge=0, le=1_000, description="Requests for images that may wait; further ones get 503."
     )
     render_threads: int = Field(1, ge=1, le=256, description="CPU threads per image.")
 

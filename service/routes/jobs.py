@@ -13,7 +13,7 @@ from jobs.job import ID_PATTERN, JobSpec
 from service.context import ContextDep, JobId
 from service.inspection import inspect_capture
 from service.problems import RESPONSES
-from service.schemas import JobPage, JobResource, job_resource
+from service.schemas import JobPage, JobResource, job_resource, job_summary
 from service.uploads import parse_config, receive_capture
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], responses=RESPONSES)
@@ -77,7 +77,7 @@ def page(
     """Jobs, newest first."""
     jobs, after = context.jobs.page(limit, cursor)
     following = None if after is None else "/jobs?" + urlencode({"limit": limit, "cursor": after})
-    return JobPage(jobs=[job_resource(job) for job in jobs], next=following)
+    return JobPage(jobs=[job_summary(job) for job in jobs], next=following)
 
 
 @router.get("/{job_id}", operation_id="get_job")

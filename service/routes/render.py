@@ -119,7 +119,7 @@ async def render(
         headers["X-Graings-Orbit"] = _orbit_header(view, camera, model.units)
     if _matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    image = await context.pool.render(model, request)
+    image = await context.pool.render(model, request, headers["ETag"])
     return Response(image, media_type=MEDIA_TYPES[format], headers=headers)
 
 

@@ -9,7 +9,7 @@ from starlette.testclient import TestClient
 
 from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError
 from jobs.job import JobConflict, JobError, JobNotFound
-from service.problems import Busy, TooLarge, install
+from service.problems import TooLarge, install
 from tests.service.test_jobs import problem
 
 
@@ -35,7 +35,6 @@ def raising(error: Exception) -> TestClient:
         (CaptureError("broken", file="a.png", remedy="Save it again."), 422, "bad-capture"),
         (CheckpointError("damaged"), 500, "bad-checkpoint"),
         (GraingsError("other"), 500, "graings"),
-        (Busy("later"), 503, "busy"),
         (TooLarge("large"), 413, "too-large"),
         (OSError(errno.ENOSPC, "No space left on device"), 507, "disk-full"),
     ],
@@ -48,9 +47,8 @@ def test_every_error_has_its_status_and_message(error: Exception, status: int, k
         assert document["detail"] == str(error)
 
 
-@pytest.mark.parametrize(("error", "seconds"), [(Busy("later"), "1"), (JobError("no answer"), "5")])
-def test_a_temporary_error_has_a_retry_after(error: Exception, seconds: str) -> None:
-    assert raising(error).get("/").headers["retry-after"] == seconds
+def test_a_temporary_error_has_a_retry_after() -> None:
+    assert raising(JobError("no answer")).get("/").headers["retry-after"] == "5"
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("secret"), PermissionError("secret"), ValueError(math.nan)])

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +20,8 @@ from graings.camera.viewpoint import orbit_view
 from graings.image_encoding import encode_image
 from graings.render import render
 from graings.storage.checkpoint import load_model
+from graings.storage.model import scene_bytes
 from jobs.store import JobFolder
-from service.problems import Busy
 from service.rendering import ModelCache, RenderPool, RenderRequest
 from service.settings import Settings
 from tests.service.conftest import ITERATIONS, SIZE
@@ -220,7 +223,7 @@ def test_a_damaged_checkpoint_hides_neither_the_one_before_nor_other_jobs(
 
 def test_a_model_is_loaded_once_until_its_checkpoint_changes(trained: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(trained, tmp_path / "run"))
-    models = ModelCache(capacity=1)
+    models = ModelCache(1)
     first = models.load(run)
     assert first is not None
     assert models.load(run) is first
@@ -233,24 +236,69 @@ def test_a_model_is_loaded_once_until_its_checkpoint_changes(trained: Path, tmp_
     assert models.load(run) is not second  # discarded for the other one
 
 
-def test_a_request_beyond_the_limit_is_refused_at_once(trained: Path) -> None:
-    pool = RenderPool(slots=1, waiting=1)
-    model = load_model(trained)
+def request_at(time: float) -> RenderRequest:
     camera = Camera.orbit(0.0, 0.0, 3.0, fov=0.7, width=8, height=8)
-    request = RenderRequest(camera, 0.0, (1.0, 1.0, 1.0), "png")
-    answers: list[str] = []
+    return RenderRequest(camera, time, (1.0, 1.0, 1.0), "png")
 
-    async def send() -> None:
-        try:
-            await pool.render(model, request)
-            answers.append("rendered")
-        except Busy:
-            answers.append("busy")
+
+def test_requests_for_one_image_share_its_rendering_and_get_equal_bytes(trained: Path) -> None:
+    model, pool = load_model(trained), RenderPool(slots=2, kept_bytes=0)
+    images: list[bytes] = []
+
+    async def send(time: float) -> None:
+        images.append(await pool.render(model, request_at(time), str(time)))
 
     async def all_at_once() -> None:
         async with anyio.create_task_group() as group:
-            for _ in range(5):
-                group.start_soon(send)
+            for time in (0.0, 0.5, 0.0, 0.0):
+                group.start_soon(send, time)
+            await anyio.sleep(0)
+            assert pool.running == 2
 
     anyio.run(all_at_once)
-    assert answers == ["busy"] * 3 + ["rendered"] * 2
+    pool.close()
+    assert len(images) == 4
+    assert len({id(image) for image in images}) == 2
+
+
+def test_the_last_images_are_kept_up_to_a_number_of_bytes(trained: Path) -> None:
+    model = load_model(trained)
+
+    async def images(kept_bytes: int, times: Sequence[float]) -> list[bytes]:
+        pool = RenderPool(slots=1, kept_bytes=kept_bytes)
+        rendered = [await pool.render(model, request_at(time), str(time)) for time in times]
+        pool.close()
+        return rendered
+
+    first, _ = anyio.run(images, 0, (0.0, 1.0))
+    again = anyio.run(images, 2 * len(first) + 20, (0.0, 1.0, 0.0, 0.5, 1.0, 0.0))
+    assert again[0] is again[2]  # kept
+    assert again[4] is not again[1]  # discarded for 0.5, since 0.0 was used later
+    assert again[5] is not again[0]  # discarded for 1.0
+    assert again[0] == again[5] == first
+    none = anyio.run(images, len(first) - 1, (0.0, 0.0))
+    assert none[0] is not none[1]
+
+
+def test_an_image_that_cannot_be_rendered_is_tried_again(trained: Path) -> None:
+    model, pool = load_model(trained), RenderPool(slots=1, kept_bytes=1_000)
+    wrong = replace(request_at(0.0), background=(1.0, 1.0, math.nan))
+
+    async def send(request: RenderRequest) -> bytes:
+        return await pool.render(model, request, "key")
+
+    with pytest.raises(ValueError, match="finite"):
+        anyio.run(send, wrong)
+    assert anyio.run(send, request_at(0.0)).startswith(b"\x89PNG")
+    pool.close()
+
+
+def test_models_are_discarded_when_they_exceed_their_memory(trained: Path, tmp_path: Path) -> None:
+    runs = [Path(shutil.copytree(trained, tmp_path / name)) for name in ("a", "b", "c")]
+    size = scene_bytes(load_model(trained).scene)
+    models = ModelCache(2 * size)
+    first, second, _ = [models.load(run) for run in runs]
+    assert models.load(runs[1]) is second
+    assert models.load(runs[0]) is not first
+    alone = ModelCache(1)
+    assert alone.load(runs[0]) is alone.load(runs[0])  # one is kept however large it is

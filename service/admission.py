@@ -1,0 +1,41 @@
+"""Admission: refuse requests that would wait too long for an image, before any work is done for them."""
+
+from __future__ import annotations
+
+import asyncio
+
+from starlette.requests import Request
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.problems import problem
+
+# A refusal is sent after this time, so that clients that send the next request at once do not take the CPU time of
+# the images. Waiting costs no thread.
+REFUSAL_DELAY_S = 0.25
+RETRY_AFTER_S = "1"
+
+
+class Admission:
+    """Middleware: at most `limit` requests for `path` at a time; a further one is answered with 503."""
+
+    def __init__(self, app: ASGIApp, path: str, limit: int) -> None:
+        self._app = app
+        self._path = path
+        self._limit = limit
+        self._admitted = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["path"] != self._path:
+            await self._app(scope, receive, send)
+            return
+        if self._admitted >= self._limit:
+            await asyncio.sleep(REFUSAL_DELAY_S)
+            detail = "Too many images are being rendered. Try again in a moment."
+            headers = {"Retry-After": RETRY_AFTER_S}
+            await problem(Request(scope), 503, detail, kind="busy", headers=headers)(scope, receive, send)
+            return
+        self._admitted += 1
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._admitted -= 1
