@@ -19,6 +19,9 @@ from jobs.worker import Worker
 
 DATABASE_FILE = "jobs.sqlite"
 
+# A training may take all cores for hours; an image or a page beside it should not wait for it.
+TRAINING_NICE = 10
+
 
 def default_database(data: Path) -> str:
     """The URL of the SQLite database in the data folder, which must be on a local disk."""
@@ -39,6 +42,12 @@ def worker(
     threads: Annotated[
         int | None, typer.Option(min=1, max=256, help="CPU threads per job (default: all cores / slots).")
     ] = None,
+    nice: Annotated[
+        int,
+        typer.Option(
+            envvar="GRAINGS_NICE", min=0, max=19, help="Lower the priority of trainings on the CPU by so much."
+        ),
+    ] = TRAINING_NICE,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="Stop when standard input ends.")
     ] = False,
@@ -55,7 +64,8 @@ def worker(
     cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     job_threads = threads or max(1, cores // slots)
     try:
-        Worker(store, database or default_database(store.root), slots=slots, threads=job_threads).run(stop)
+        url = database or default_database(store.root)
+        Worker(store, url, slots=slots, threads=job_threads, nice=nice).run(stop)
     except JobError as error:
         typer.echo(f"worker: {error}", err=True)
         raise typer.Exit(1) from error

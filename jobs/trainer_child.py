@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import signal
 import sys
 from dataclasses import dataclass
@@ -25,11 +26,12 @@ class ProcessExit:
 
 
 class TrainerChild:
-    """A child process that trains in one job folder."""
+    """A child process that trains in one job folder, with its priority on the CPU lowered by `nice` (0 to 19)."""
 
-    def __init__(self, folder: JobFolder, threads: int, grace_s: float = GRACE_S) -> None:
+    def __init__(self, folder: JobFolder, threads: int, *, nice: int = 0, grace_s: float = GRACE_S) -> None:
         self._folder = folder
         self._threads = threads
+        self._nice = nice
         self._grace_s = grace_s
         self._loop = asyncio.get_running_loop()
         self._process: asyncio.subprocess.Process | None = None
@@ -49,6 +51,8 @@ class TrainerChild:
                 # A Ctrl-C in the terminal goes to the worker only, which then stops the child.
                 start_new_session=True,
             )  # fmt: skip
+        # At once: the threads that it will start inherit it.
+        os.setpriority(os.PRIO_PROCESS, self._process.pid, min(19, os.getpriority(os.PRIO_PROCESS, 0) + self._nice))
         if self._stopping:
             self._signal()
         waiting = asyncio.ensure_future(self._wait(self._process))

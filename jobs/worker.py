@@ -32,14 +32,15 @@ MAX_WORKER_DEATHS = 5
 
 
 class Worker:
-    """One worker process: `slots` jobs at a time, `threads` CPU threads each."""
+    """One worker process: `slots` jobs at a time, `threads` CPU threads each, with a priority lowered by `nice`."""
 
-    def __init__(self, store: Store, database_url: str, *, slots: int = 1, threads: int = 1) -> None:
+    def __init__(self, store: Store, database_url: str, *, slots: int = 1, threads: int = 1, nice: int = 0) -> None:
         self.id = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
         self._store = store
         self._url = database_url
         self._slots = slots
         self._threads = threads
+        self._nice = nice
         self._trainers: dict[str, TrainerChild] = {}
         self._stopping = False
 
@@ -116,7 +117,7 @@ class Worker:
                 return Outcome(JobState.FAILED, reason)
             attempt = folder.begin_attempt(self.id)
             LOG.info("job %s: attempt %d from iteration %d", job_id, attempt.number, attempt.checkpoint)
-            trainer = TrainerChild(folder, self._threads)
+            trainer = TrainerChild(folder, self._threads, nice=self._nice)
             try:
                 ending = await self._run_trainer(job_id, trainer)
             except asyncio.CancelledError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 
 from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
-from jobs.commands import default_database
+from jobs.commands import TRAINING_NICE, default_database
 from jobs.engine import Engine
 from jobs.exit_code import ExitCode
 from jobs.job import Attempt, JobConflict, JobSpec, JobState
@@ -62,6 +63,15 @@ def until(condition: Callable[[], object]) -> None:
         time.sleep(0.1)
 
 
+def thread_priorities(worker: int, module: str) -> list[int]:
+    """Nice values of all threads of the worker's children that run `module`; Linux only."""
+    children = Path(f"/proc/{worker}/task").glob("*/children")
+    pids = [int(pid) for file in children for pid in file.read_text().split()]
+    trainers = [pid for pid in pids if module in Path(f"/proc/{pid}/cmdline").read_text()]
+    threads = [int(task.name) for pid in trainers for task in Path(f"/proc/{pid}/task").iterdir()]
+    return [os.getpriority(os.PRIO_PROCESS, thread) for thread in threads]
+
+
 def is_idle(jobs: JobQueue, job_id: str) -> bool:
     """Whether no trainer holds the job's folder."""
     with locked(jobs.store.folder(job_id).lock, wait=False) as free:
@@ -75,6 +85,8 @@ def test_another_worker_continues_the_job_of_a_killed_one_and_returns_it_to_the_
     folder = jobs.store.folder(job_id)
     with working(jobs) as first:
         until(lambda: folder.checkpoint())
+        lowered = min(19, os.getpriority(os.PRIO_PROCESS, 0) + TRAINING_NICE)
+        assert set(thread_priorities(first.pid, "jobs.trainer_process")) == {lowered}
         first.send_signal(signal.SIGKILL)
         first.wait()
         reached = folder.checkpoint() or 0
