@@ -37,7 +37,7 @@ START_S = 60.0
 LUA = """
 local counter = 0
 local threads = {}
-function setup(thread) counter = counter + 1; thread:set("seed", counter); table.insert(threads, thread) end
+function setup(thread) counter = counter + 1; thread:set("seed", SEED + counter); table.insert(threads, thread) end
 function init() math.randomseed(seed); served, refused, failed = 0, 0, 0 end
 function request()
   return wrk.format("GET", string.format("/render?width=SIDE&t=%.7f&azimuth=%.5f", math.random(), 360 * math.random()))
@@ -67,6 +67,7 @@ class Probe(threading.Thread):
         super().__init__(daemon=True)
         self._port, self._path = port, path
         self._ended = threading.Event()
+        self._first = time.time_ns() % 10**9
         self.latencies: list[float] = []
         self.refused = 0
 
@@ -77,7 +78,7 @@ class Probe(threading.Thread):
         while not self._ended.wait(PAUSE_S):
             number += 1
             started = time.perf_counter()
-            connection.request("GET", self._path.replace("NUMBER", str(number)))
+            connection.request("GET", self._path.replace("NUMBER", str(self._first + number)))
             response = connection.getresponse()
             response.read()
             if response.status == 200:
@@ -153,19 +154,22 @@ def resident_mb(pid: int) -> float:
     raise RuntimeError(f"/proc/{pid}/status has no VmRSS")
 
 
-def measure(port: int, pid: int, clients: int, seconds: int, side: int, script: Path) -> dict[str, Any]:
-    """One row of the table."""
+def measure(port: int, pid: int, clients: int, seconds: int, side: int) -> dict[str, Any]:
+    """One row of the table. No image is asked for twice, so that none is a kept one."""
     probes = {
-        "render": Probe(port, f"/render?width={side}&t=0.5&azimuth=NUMBER"),
+        "render": Probe(port, f"/render?width={side}&t=0.5&azimuth=0.NUMBER"),
         "jobs": Probe(port, "/jobs"),
         "healthz": Probe(port, "/healthz"),
     }
     for probe in probes.values():
         probe.start()
+    script = LUA.replace("SIDE", str(side)).replace("SEED", str(time.time_ns() % 10**9))
     command = ["wrk", "-t", str(min(2, clients)), "-c", str(clients), "-d", f"{seconds}s", "--timeout", "60s"]
-    output = subprocess.run(
-        [*command, "-s", str(script), f"http://127.0.0.1:{port}"], check=True, capture_output=True, text=True
-    ).stdout
+    with tempfile.NamedTemporaryFile("w", suffix=".lua") as file:
+        file.write(script)
+        file.flush()
+        command += ["-s", file.name, f"http://127.0.0.1:{port}"]
+        output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     result = json.loads(next(line for line in output.splitlines() if line.startswith("RESULT")).removeprefix("RESULT "))
     row = {"clients": clients, **result, **{name: probe.end() for name, probe in probes.items()}}
     row["served_per_s"] = round(result["served"] / result["seconds"], 1)
@@ -215,8 +219,6 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        script = folder / "load.lua"
-        script.write_text(LUA.replace("SIDE", str(arguments.side)))
         data_folder(folder, arguments.run, arguments.interpreter)
         with serving(folder, arguments.interpreter, arguments.training is not None) as (port, pid):
             print(f"memory at rest: {resident_mb(pid):.0f} MB", flush=True)
@@ -226,7 +228,7 @@ def main() -> None:
             if status != 200:
                 raise RuntimeError(f"GET /render: {body.decode()}")
             for clients in arguments.clients:
-                rows.append(measure(port, pid, clients, arguments.seconds, arguments.side, script))
+                rows.append(measure(port, pid, clients, arguments.seconds, arguments.side))
                 print(table(rows).splitlines()[-1], flush=True)
     print("\n" + table(rows))
     if arguments.json is not None:

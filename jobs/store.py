@@ -19,6 +19,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 from graings.storage.files import sync_folder, sync_tree, write_json
@@ -75,7 +76,7 @@ class JobFolder:
         """The specification. Raises `JobDamaged`, and `JobNotFound` if the job was deleted meanwhile."""
         file = self.path / "job.json"
         try:
-            return JobSpec(**json.loads(file.read_text())["spec"])
+            return _read_spec(str(file), file.stat().st_mtime_ns)
         except (OSError, ValueError, KeyError, TypeError) as error:
             if not self.path.is_dir():
                 raise JobNotFound(self.path.name) from error
@@ -198,6 +199,12 @@ class Store:
         """Only one process at a time adds or removes jobs and captures."""
         with locked(self.root / "store.lock"):
             yield
+
+
+@lru_cache(maxsize=1_000)
+def _read_spec(file: str, modified_ns: int) -> JobSpec:
+    """The specification in a file, which is read again only after it was written again."""
+    return JobSpec(**json.loads(Path(file).read_text())["spec"])
 
 
 def discard_leftovers(uploads: Path) -> None:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import random
 
 from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.problems import problem
 
-# A refusal is sent after this time, so that clients that send the next request at once do not take the CPU time of
-# the images. Waiting costs no thread.
-REFUSAL_DELAY_S = 0.25
-RETRY_AFTER_S = "1"
+# A refusal is sent only about when the client may try again: many clients do so at once, and hundreds of them would take
+# the CPU time of the images. The times are spread, so that they do not all come back together. Waiting costs no thread.
+RETRY_AFTER_S = 1
 
 
 class Admission:
@@ -29,9 +29,9 @@ class Admission:
             await self._app(scope, receive, send)
             return
         if self._admitted >= self._limit:
-            await asyncio.sleep(REFUSAL_DELAY_S)
+            await asyncio.sleep(random.uniform(0.5, 1.5) * RETRY_AFTER_S)
             detail = "Too many images are being rendered. Try again in a moment."
-            headers = {"Retry-After": RETRY_AFTER_S}
+            headers = {"Retry-After": str(RETRY_AFTER_S)}
             await problem(Request(scope), 503, detail, kind="busy", headers=headers)(scope, receive, send)
             return
         self._admitted += 1

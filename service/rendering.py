@@ -7,6 +7,8 @@ the least recently used one is discarded first.
 from __future__ import annotations
 
 import asyncio
+import os
+import sys
 import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +26,9 @@ from graings.storage.model import Model, scene_bytes
 from graings.storage.run_folder import newest_model
 
 _Key = tuple[str, int]
+
+# Priority of rendering threads below that of the others; trainings have a still lower one.
+NICE = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +92,7 @@ class RenderPool:
     """
 
     def __init__(self, slots: int, kept_bytes: int) -> None:
-        self._executor = ThreadPoolExecutor(slots, thread_name_prefix="render")
+        self._executor = ThreadPoolExecutor(slots, thread_name_prefix="render", initializer=_lower_priority)
         self._kept_bytes = kept_bytes
         self._kept: OrderedDict[str, bytes] = OrderedDict()
         self._running: dict[str, asyncio.Future[bytes]] = {}
@@ -122,6 +127,12 @@ class RenderPool:
         size = sum(map(len, self._kept.values()))
         while size > self._kept_bytes:
             size -= len(self._kept.popitem(last=False)[1])
+
+
+def _lower_priority() -> None:
+    """Let threads that answer other requests run before this one, where a thread has a priority of its own (Linux)."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICE))
 
 
 def _rendered(model: Model, request: RenderRequest) -> bytes:
