@@ -10,7 +10,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.problems import problem
 
-# A refusal is sent only about when the client may try again: many clients do so at once, and hundreds of them would take
+# A refusal is sent only about when the client may try again: many do so at once, and hundreds of them would take
 # the CPU time of the images. The times are spread, so that they do not all come back together. Waiting costs no thread.
 RETRY_AFTER_S = 1
 
