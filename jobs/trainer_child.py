@@ -10,7 +10,9 @@ import json
 import os
 import signal
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 from jobs.store import JobFolder
 
@@ -51,8 +53,7 @@ class TrainerChild:
                 # A Ctrl-C in the terminal goes to the worker only, which then stops the child.
                 start_new_session=True,
             )  # fmt: skip
-        # At once: the threads that it will start inherit it.
-        os.setpriority(os.PRIO_PROCESS, self._process.pid, min(19, os.getpriority(os.PRIO_PROCESS, 0) + self._nice))
+        _lower_priority(self._process.pid, self._nice)
         if self._stopping:
             self._signal()
         waiting = asyncio.ensure_future(self._wait(self._process))
@@ -82,6 +83,16 @@ class TrainerChild:
         assert process.stdout is not None  # a pipe, see `run`
         output = await process.stdout.read()
         return ProcessExit(await process.wait(), _message(output))
+
+
+def _lower_priority(pid: int, nice: int) -> None:
+    """Lower the priority of a process that has just been started; threads that it will start inherit it."""
+    lowered = min(19, os.getpriority(os.PRIO_PROCESS, 0) + nice)
+    os.setpriority(os.PRIO_PROCESS, pid, lowered)
+    # Desktops schedule each session as a group first, and the child has a session of its own: there only the priority
+    # of the group counts against other sessions.
+    with suppress(OSError):  # no such groups here
+        Path(f"/proc/{pid}/autogroup").write_text(str(lowered))
 
 
 def _kill(process: asyncio.subprocess.Process) -> None:

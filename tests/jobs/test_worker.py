@@ -65,11 +65,20 @@ def until(condition: Callable[[], object]) -> None:
 
 def thread_priorities(worker: int, module: str) -> list[int]:
     """Nice values of all threads of the worker's children that run `module`; Linux only."""
-    children = Path(f"/proc/{worker}/task").glob("*/children")
-    pids = [int(pid) for file in children for pid in file.read_text().split()]
-    trainers = [pid for pid in pids if module in Path(f"/proc/{pid}/cmdline").read_text()]
-    threads = [int(task.name) for pid in trainers for task in Path(f"/proc/{pid}/task").iterdir()]
+    threads = [int(task.name) for pid in children(worker, module) for task in Path(f"/proc/{pid}/task").iterdir()]
     return [os.getpriority(os.PRIO_PROCESS, thread) for thread in threads]
+
+
+def session_priorities(worker: int, module: str) -> list[int]:
+    """Nice values of the scheduling groups of the children's sessions; empty where the kernel has no such groups."""
+    files = [Path(f"/proc/{pid}/autogroup") for pid in children(worker, module)]
+    return [int(file.read_text().split()[-1]) for file in files if file.exists()]
+
+
+def children(worker: int, module: str) -> list[int]:
+    files = Path(f"/proc/{worker}/task").glob("*/children")
+    pids = [int(pid) for file in files for pid in file.read_text().split()]
+    return [pid for pid in pids if module in Path(f"/proc/{pid}/cmdline").read_text()]
 
 
 def is_idle(jobs: JobQueue, job_id: str) -> bool:
@@ -87,6 +96,7 @@ def test_another_worker_continues_the_job_of_a_killed_one_and_returns_it_to_the_
         until(lambda: folder.checkpoint())
         lowered = min(19, os.getpriority(os.PRIO_PROCESS, 0) + TRAINING_NICE)
         assert set(thread_priorities(first.pid, "jobs.trainer_process")) == {lowered}
+        assert set(session_priorities(first.pid, "jobs.trainer_process")) <= {lowered}
         first.send_signal(signal.SIGKILL)
         first.wait()
         reached = folder.checkpoint() or 0
