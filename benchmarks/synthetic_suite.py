@@ -3,6 +3,7 @@
     python benchmarks/synthetic_suite.py FOLDER                          generate all scenes, print seconds and MB
     python benchmarks/synthetic_suite.py FOLDER --train draft standard   train each on top, print the table of results
     python benchmarks/synthetic_suite.py FOLDER --sheet SHEET.png        draw the contact sheet
+    python benchmarks/synthetic_suite.py FOLDER --train draft --gallery GALLERY.png    and views of the trained models
 
 Captures lie in FOLDER/SIZE/NAME, runs in FOLDER/SIZE/runs/NAME-PRESET. What is finished is not repeated; an interrupted
 training is resumed. Seconds are CPU seconds of all processes (user + sys) and the same divided by two: the time on two
@@ -26,11 +27,16 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
+from graings.camera.viewpoint import sized
 from graings.capture.synthetic import SUITE
 from graings.capture.synthetic.drawing import draw
 from graings.capture.synthetic.viewpoint import on_path
+from graings.image_encoding import encode_image
+from graings.render import render
+from graings.storage.checkpoint import load_model
 
 TIMES = (0.1, 0.45, 0.8)
+GALLERY_TIMES = (0.05, 0.25, 0.45, 0.65, 0.85)
 TILE = 120
 CAPTION = 16
 # Which camera of the path shows a scene well on the contact sheet.
@@ -167,6 +173,18 @@ def strip(name: str, tile: int) -> np.ndarray:
     return np.concatenate([caption.get_pixels(oiio.UINT8), drawn])
 
 
+def gallery(file: Path, folder: Path, names: Sequence[str], preset: str) -> None:
+    """Trained models at five times each, seen by a camera of their test split; one scene a row, at half size."""
+    rows = []
+    for name in names:
+        model = load_model(folder / "runs" / f"{name}-{preset}")
+        view = model.views["test"][len(model.views["test"]) // 3]
+        camera = sized(view.camera, view.camera.width // 2)
+        images = [render(model.scene, camera, time, model.background).color for time in GALLERY_TIMES]
+        rows.append(np.concatenate([np.clip(image.numpy(), 0.0, 1.0) for image in images], axis=1))
+    file.write_bytes(encode_image(np.concatenate(rows)))
+
+
 def main() -> None:
     """Generate, and draw or train as the arguments say."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -177,6 +195,7 @@ def main() -> None:
     parser.add_argument("--train", nargs="+", metavar="PRESET", default=[])
     parser.add_argument("--set", nargs="+", action="extend", metavar="OPTION=VALUE", default=[], help="for training")
     parser.add_argument("--sheet", type=Path)
+    parser.add_argument("--gallery", type=Path, help="of the first preset of --train")
     arguments = parser.parse_args()
     if arguments.sheet is not None:
         sheet(arguments.sheet, arguments.scenes, TILE)
@@ -191,6 +210,8 @@ def main() -> None:
         for name in arguments.scenes:
             for preset in arguments.train:
                 print(result_row(name, preset, train(folder, name, preset, extra)), flush=True)
+        if arguments.gallery is not None:
+            gallery(arguments.gallery, folder, arguments.scenes, arguments.train[0])
 
 
 if __name__ == "__main__":
