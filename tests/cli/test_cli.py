@@ -213,7 +213,7 @@ def test_a_read_only_path_is_named_with_a_remedy(run: Path, capsys: pytest.Captu
         (["train", "CAPTURE", "-o", "RUN", "--set", "iterations=0"], 2, "iterations"),
         (["train", "CAPTURE", "-o", "RUN", "--set", "no.such=1"], 2, "no"),
         (["train", "CAPTURE", "-o", "RUN", "--set", "iterations"], 2, "key=value"),
-        (["train", "CAPTURE", "-o", "RUN", "--preset", "best"], 2, "draft, standard, fine, paper"),
+        (["train", "CAPTURE", "-o", "RUN", "--preset", "best"], 2, "draft, standard, fine, long, paper"),
         (["train", "CAPTURE", "-o", "RUN", "--resume", "--set", "seed=1"], 2, "keeps its options"),
         (["train", "-o", "RUN"], 2, "capture"),
         (["train", "ABSENT", "-o", "RUN"], 65, "absent"),
@@ -285,7 +285,13 @@ def test_options_as_json_are_the_schema(capsys: pytest.CaptureFixture[str]) -> N
     assert graings("options", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     schedules = {name: (preset["iterations"], preset["batch"]) for name, preset in document["presets"].items()}
-    assert schedules == {"draft": (1_100, 4), "standard": (5_000, 4), "fine": (15_000, 4), "paper": (30_000, 1)}
+    assert schedules == {
+        "draft": (1_100, 4),
+        "standard": (5_000, 4),
+        "fine": (15_000, 4),
+        "long": (30_000, 1),
+        "paper": (30_000, 1),
+    }
     assert "iterations" in document["schema"]["properties"]
 
 
