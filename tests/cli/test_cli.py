@@ -265,7 +265,8 @@ def test_options_are_listed_with_value_bounds_and_help(
     monkeypatch.setenv("COLUMNS", "200")
     assert graings("options", "--preset", "draft") == 0
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.strip()}
-    assert lines["density.max_anchors"].split()[:4] == ["density.max_anchors", "1600", "≥", "16"]
+    assert lines["density.max_anchors"].split()[:5] == ["density.max_anchors", "1600", "*", "≥", "16"]
+    assert lines["density.levels"].split()[:4] == ["density.levels", "3", "≥", "1,"]
     assert "Maximum number of anchors after growth" in lines["density.max_anchors"]
     assert lines["rates.deformation"].split() == ["rates.deformation", "[0.002,", "5e-05]", "≥", "0", "DeformNet."]
 
