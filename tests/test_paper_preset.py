@@ -90,7 +90,7 @@ READINGS: Final[dict[str, Any]] = {
     "rates.log_scales": (0.007, 0.007),
     "rates.static": (0.004, 0.004),
     "rates.color": (0.008, 5e-5),
-    "rates.opacity": (0.0007, 7e-6),
+    "rates.opacity": (0.002, 2e-5),
     "rates.residual": (0.002, 2e-5),
     "rates.deformation": (8e-4, 1.6e-6),
 }

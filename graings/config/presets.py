@@ -98,6 +98,7 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
             "log_scales": (0.007, 0.007),
             "static": (0.004, 0.004),
             "color": (0.008, 5e-5),
+            "opacity": (0.002, 2e-5),
             "deformation": (8e-4, 1.6e-6),
         },
         "guard": {"skip_only": True},
