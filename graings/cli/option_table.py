@@ -16,7 +16,9 @@ from graings.config import ConfigSection, make_config, options
 
 
 def show_options(
-    preset: Annotated[str, typer.Option(help="Show the values of this preset.")] = "standard",
+    preset: Annotated[
+        str, typer.Option(help="Show the values of this preset; a star marks those that are not the default.")
+    ] = "standard",
     as_json: Annotated[bool, typer.Option("--json", help="JSON schema and presets instead of a table.")] = False,
 ) -> None:
     """List every option of --set."""
@@ -25,8 +27,10 @@ def show_options(
         console.print_json(json.dumps(options()))
         return
     table = Table("option", "value", "bounds", "", box=None, pad_edge=False, header_style="bold")
+    defaults = {name: value for name, value, *_ in _fields(make_config())}
     for name, value, bounds, text in _fields(make_config(preset)):
-        table.add_row(Text(name), Text(value, style="cyan"), Text(bounds, style="dim"), Text(text))
+        shown = Text(value, style="cyan") if value == defaults[name] else Text(f"{value} *", style="bold cyan")
+        table.add_row(Text(name), shown, Text(bounds, style="dim"), Text(text))
     console.print(table)
 
 

@@ -1,7 +1,8 @@
-"""The sections of the options: every number a user may set, with default, bounds and a description.
+"""The sections of the options that describe images, model and loss: numbers with default, bounds and a description.
 
-Each section is read by one package, named in its docstring. Iterations "in a schedule of 30 000", the paper's, are
-scaled with `iterations`, so that a shorter run has the same proportions. Descriptions are shown by `graings options`.
+Those of the optimisation are in `optimization`. Each section is read by one package, named in its docstring.
+Iterations "in a schedule of 30 000", the paper's, are scaled with `iterations`, so that a shorter run has the same
+proportions. Descriptions are shown by `graings options`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ class ConfigSection(BaseModel):
 
 
 Channel = Annotated[float, Field(ge=0, le=1)]
-FirstAndLast = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
 
 
 class CaptureConfig(ConfigSection):
@@ -85,6 +85,16 @@ class SceneConfig(ConfigSection):
         "child",
         description="child: one deformation per Gaussian (the paper's method); anchor: one per anchor, shared by its "
         "children; none: a static scene.",
+    )
+    learnable_anchors: bool = Field(
+        False,
+        description="Learn the anchor positions x_a, as in Eq. 3. false: they stay on the voxel grid, and the offsets "
+        "of the children adapt alone.",
+    )
+    relative_scales: bool = Field(
+        True,
+        description="Log-scales from StaticMLP are relative to log s_a, the size of the anchor. false: rho_can is "
+        "StaticMLP's alone, in units of the scene's extent, as in Eq. 5.",
     )
     stop_gradient: bool = Field(True, description="Stop the gradient from DeformNet to the canonical position (Eq. 7).")
     single_mlp: bool = Field(False, description="Ablation: a single network for canonical geometry and deformation.")
@@ -175,6 +185,11 @@ class LossConfig(ConfigSection):
         "in the paper: without it surfaces of the background's colour may have holes, and empty space may be opaque.",
     )
     temporal: float = Field(0.01, ge=0, description="lambda_1: temporal smoothness of the deformed positions.")
+    temporal_sum: bool = Field(
+        False,
+        description="Estimate the sum of the temporal term over all pairs of neighbouring training times, as in "
+        "Eq. 16, rather than its mean over them.",
+    )
     deformation: float = Field(0.001, ge=0, description="lambda_2: magnitude of the deformation.")
     residual: float = Field(0.01, ge=0, description="lambda_3: magnitude of the appearance residual.")
     rigidity: float = Field(
@@ -186,102 +201,3 @@ class LossConfig(ConfigSection):
     temporal_share: float = Field(
         0.1, gt=0, le=1, description="Fraction of the drawn children in the temporal term of each step."
     )
-
-
-class DensityConfig(ConfigSection):
-    """Growing and pruning of anchors. Read by `graings.training.density`."""
-
-    statistics_from: int = Field(
-        500, ge=0, description="First iteration of the growth statistics, in a schedule of 30 000."
-    )
-    grow_from: int = Field(1_500, ge=0, description="Iteration of the first growth, in a schedule of 30 000.")
-    grow_until: int = Field(20_000, ge=0, description="Iteration of the last growth, in a schedule of 30 000.")
-    grow_every: int = Field(50, ge=1, description="Iterations between growths (not scaled).")
-    gradient_threshold: float = Field(
-        2e-4, gt=0, description="tau_g: mean screen-space gradient, NDC units, above which a child grows new anchors."
-    )
-    min_observations: int = Field(
-        40, ge=0, description="tau_obs: how often a child must have been drawn before it may grow (not scaled)."
-    )
-    levels: int = Field(3, ge=1, le=6, description="Number of voxel sizes for new anchors: 4^(levels-1) v, ..., v.")
-    new_anchor_opacity: float | None = Field(
-        None,
-        gt=0.004,
-        lt=0.99,
-        description="Initial opacity of a new anchor's most opaque child; null: that of the parent.",
-    )
-    max_anchors: int = Field(
-        12_000,
-        ge=16,
-        description="Maximum number of anchors after growth; candidates with the largest gradients are preferred.",
-    )
-    memory_mb: int = Field(
-        4096, ge=1, description="Memory budget for the anchors and one training step, MB; growth stops at it."
-    )
-    prune_from: int = Field(24_600, ge=0, description="Iteration of the first pruning, in a schedule of 30 000.")
-    prune_until: int = Field(29_000, ge=0, description="Iteration of the last pruning, in a schedule of 30 000.")
-    prune_every: int = Field(500, ge=1, description="Iterations between prunings.")
-    prune_opacity: float = Field(
-        0.005, ge=0, description="Anchors whose summed child opacity stays below this are removed."
-    )
-    prune_min_views: int = Field(
-        80, ge=1, description="How many views must have seen an anchor before it may be removed (not scaled)."
-    )
-
-
-class RatesConfig(ConfigSection):
-    """Learning rates, first and last, log-linear in between. Read by `graings.training.optimizer`.
-
-    They are those of Adam, except `matrices`: the hidden weight matrices of `static` and `deformation` under Muon.
-    """
-
-    offsets: FirstAndLast = Field((0.02, 1e-3), description="Child offsets, in units of s_a.")
-    features: FirstAndLast = Field((0.0075, 0.003), description="Anchor features.")
-    log_scales: FirstAndLast = Field((0.007, 0.003), description="log s_a of the anchors.")
-    opacity_offsets: FirstAndLast = Field(
-        (0.02, 0.002), description="Offset that an anchor adds to the opacity logits of its children."
-    )
-    static: FirstAndLast = Field((0.004, 0.0004), description="StaticMLP.")
-    color: FirstAndLast = Field(
-        (0.008, 2e-4), description="Colour head, including the network of its reflection normals."
-    )
-    opacity: FirstAndLast = Field(
-        (0.0007, 7e-6),
-        description="Opacity head. At three times this rate a scene may become transparent before its colours fit.",
-    )
-    residual: FirstAndLast = Field((0.002, 2e-5), description="Network of the temporal appearance residual.")
-    deformation: FirstAndLast = Field((2e-3, 5e-5), description="DeformNet.")
-    matrices: FirstAndLast = Field(
-        (2e-3, 5e-5), description="Hidden weight matrices of StaticMLP and DeformNet with matrix_optimizer muon."
-    )
-
-
-class GuardConfig(ConfigSection):
-    """Gradient clipping and rollback of a diverging run. Read by `graings.training.guard`."""
-
-    clip: float = Field(
-        100.0,
-        gt=1,
-        le=1e6,
-        description="The gradient norm of a parameter group is clipped to this multiple of its recent median.",
-    )
-    excess: float = Field(
-        2.0, gt=1, le=100, description="A mean loss above this multiple of the best one counts as diverging."
-    )
-    patience: int = Field(200, ge=1, description="Consecutive diverging steps before training returns to a snapshot.")
-    rollbacks: int = Field(
-        3, ge=0, le=20, description="Maximum number of returns to a snapshot; each one halves the learning rates."
-    )
-    snapshot_every: int = Field(500, ge=1, description="Iterations between snapshots.")
-    check_every: int = Field(
-        100, ge=1, description="Iterations between checks that all parameters and optimizer moments are finite."
-    )
-
-
-class EvaluationConfig(ConfigSection):
-    """Held-out evaluation and checkpoints during a run. Read by `graings.training.run`."""
-
-    first: int = Field(50, ge=1, description="Iteration of the first evaluation.")
-    factor: float = Field(1.5, gt=1, description="Ratio between the iterations of successive evaluations.")
-    views: int = Field(8, ge=1, description="Held-out views per evaluation during training; all of them at the end.")
-    checkpoint_every: int = Field(500, ge=1, description="Iterations between checkpoints.")

@@ -6,24 +6,15 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
+from graings.config.optimization import DensityConfig, EvaluationConfig, GuardConfig, RatesConfig
 from graings.config.presets import PAPER_ITERATIONS, PRESETS
-from graings.config.sections import (
-    CaptureConfig,
-    ConfigSection,
-    DensityConfig,
-    EvaluationConfig,
-    GuardConfig,
-    InitConfig,
-    LossConfig,
-    RatesConfig,
-    SceneConfig,
-)
+from graings.config.sections import CaptureConfig, ConfigSection, InitConfig, LossConfig, SceneConfig
 
 
 class TrainConfig(ConfigSection):
     """All options of a training run."""
 
-    preset: Literal["draft", "standard", "fine", "paper"] = Field(
+    preset: Literal["draft", "standard", "fine", "long", "paper"] = Field(
         "standard", description="Name of the set of defaults that the other options change."
     )
     iterations: int = Field(5_000, ge=1, le=1_000_000, description="Number of optimisation steps.")

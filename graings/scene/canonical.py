@@ -21,11 +21,11 @@ class StaticMLP(nn.Module):
     """(f_a, eps_j, e_j) -> (r_can, rho_can) for each child independently, Eq. 5.
 
     `e_j` is a learned code per child slot that all anchors share; it is stored directly as its part of the first
-    layer. Without it the children of a new anchor, whose offsets are all zero, would stay identical. rho_can is
-    relative to log s_a. The feature's part of the first layer is computed once per anchor.
+    layer. Without it the children of a new anchor, whose offsets are all zero, would stay identical. Log-scales start
+    at `initial_log_scale`. The feature's part of the first layer is computed once per anchor.
     """
 
-    def __init__(self, config: SceneConfig) -> None:
+    def __init__(self, config: SceneConfig, initial_log_scale: float) -> None:
         super().__init__()
         width = config.static_width
         self.from_feature = nn.Linear(config.feature_dim, width)
@@ -35,10 +35,10 @@ class StaticMLP(nn.Module):
         with torch.no_grad():
             self.out.weight.mul_(0.1)
             self.out.bias.zero_()
-            self.out.bias[4:] = math.log(INITIAL_SCALE)
+            self.out.bias[4:] = initial_log_scale
 
     def forward(self, features: Float[Tensor, "anchor feature"], children: Children) -> Float[Tensor, "gaussian 7"]:
-        """Of each child: quaternion minus the identity (1, 0, 0, 0), and log-scale minus log s_a."""
+        """Of each child: quaternion minus the identity (1, 0, 0, 0), and log-scale minus that of its unit."""
         first = torch.cat([self.from_offset.weight, self.child_bias.t()], dim=1)
         shared = perceptron(features, [self.from_feature.weight], [self.from_feature.bias])
         zero_bias = torch.zeros_like(self.from_feature.bias)

@@ -137,10 +137,13 @@ class _Gather(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, v_inputs: Tensor, v_means: Tensor, v_anchor_log_scales: Tensor) -> tuple[Tensor | None, ...]:
         anchors, log_scales, offsets, children = ctx.saved_tensors
-        gradients = [torch.empty_like(t) for t in (log_scales, offsets)]
+        gradients: list[Tensor | None] = [torch.empty_like(t) for t in (log_scales, offsets)]
         upstream = [v.contiguous() for v in (v_inputs, v_means, v_anchor_log_scales)]
         kernel.kernel().gather_gradient(anchors, log_scales, offsets, children, *upstream, *gradients, ctx.threads)
-        return (*gradients, None, None, None)
+        v_anchors = None
+        if ctx.needs_input_grad[2]:
+            v_anchors = torch.zeros_like(anchors).index_add_(0, children // offsets.shape[1], upstream[1])
+        return (*gradients, v_anchors, None, None)
 
 
 class _Compose(torch.autograd.Function):

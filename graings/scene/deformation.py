@@ -5,7 +5,6 @@ The stop-gradient of Eq. 7 is applied by `Scene`, which passes the positions.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from graings.config import SceneConfig
-from graings.scene.canonical import INITIAL_SCALE
 from graings.scene.children import Children
 from graings.scene.encoding import encoding_width, frequency_encoding
 from graings.scene.perceptron import GroupBias, perceptron, weights_and_biases
@@ -104,7 +102,7 @@ class SingleMLP(nn.Module):
     with the same time conditioning.
     """
 
-    def __init__(self, config: SceneConfig) -> None:
+    def __init__(self, config: SceneConfig, initial_log_scale: float) -> None:
         super().__init__()
         self.position_frequencies = config.position_frequencies
         self.time_frequencies = config.time_frequencies
@@ -120,7 +118,7 @@ class SingleMLP(nn.Module):
             self.out.weight.mul_(0.1)
             self.out.weight[7:].zero_()
             self.out.bias.zero_()
-            self.out.bias[4:7] = math.log(INITIAL_SCALE)
+            self.out.bias[4:7] = initial_log_scale
 
     def forward(
         self,

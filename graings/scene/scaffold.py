@@ -11,9 +11,10 @@ class Scaffold(nn.Module):
     """A anchors with k child slots each.
 
     `anchors` [A, 3] and `uids` [A] are buffers: anchors stay on the voxel grid on which they were created, and the
-    child offsets adapt the positions. Parameters: `log_scales` [A, 3] (log s_a, normalised units), `features`
-    [A, d_f], `offsets` [A, k, 3] (epsilon of Eq. 4, in units of s_a), `opacity_offsets` [A] (added inside the tanh of
-    Eq. 11, so that a new anchor can start with low opacity although it inherits its parent's features).
+    child offsets adapt the positions. After `learn_anchors`, `anchors` is a parameter. Parameters: `log_scales` [A, 3]
+    (log s_a, normalised units), `features` [A, d_f], `offsets` [A, k, 3] (epsilon of Eq. 4, in units of s_a),
+    `opacity_offsets` [A] (added inside the tanh of Eq. 11, so that a new anchor can start with low opacity although it
+    inherits its parent's features).
     """
 
     ROWS = ("anchors", "uids", "log_scales", "features", "offsets", "opacity_offsets")  # tensors with a row per anchor
@@ -38,6 +39,12 @@ class Scaffold(nn.Module):
         self.features = nn.Parameter(features)
         self.offsets = nn.Parameter(offsets)
         self.opacity_offsets = nn.Parameter(anchors.new_zeros(count) if opacity_offsets is None else opacity_offsets)
+
+    def learn_anchors(self) -> None:
+        """Make the anchor positions a parameter, as in Eq. 3."""
+        positions = self.anchors.detach()
+        del self.anchors
+        self.anchors = nn.Parameter(positions)
 
     @property
     def count(self) -> int:

@@ -7,8 +7,9 @@ does. The rendered image is the same as with all children.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from graings.gaussians import Gaussians
 from graings.random import torch_stream
 from graings.scene.activations import tanh
 from graings.scene.appearance import CanonicalAppearance, ResidualField
-from graings.scene.canonical import StaticMLP, default_geometry
+from graings.scene.canonical import INITIAL_SCALE, StaticMLP, default_geometry
 from graings.scene.children import Children, compose, gather
 from graings.scene.clip import clip
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP, deformation_from
@@ -74,6 +75,13 @@ class Scene(nn.Module):
         self.register_buffer("extent", torch.tensor(float(extent), dtype=scaffold.features.dtype))
         self.sampling = sampling
         self.temporal = False
+        if config.learnable_anchors:
+            scaffold.learn_anchors()
+        # Of the networks' log-scales: that of each anchor, or one for all.
+        self.log_unit = None if config.relative_scales or not config.canonical else math.log(float(self.extent))
+        initial_log_scale = math.log(INITIAL_SCALE)
+        if self.log_unit is not None:
+            initial_log_scale += float(scaffold.log_scales.detach().median()) - self.log_unit
         self.residual: ResidualField | None = None
         self.single: SingleMLP | None = None
         self.static: StaticMLP | None = None
@@ -86,10 +94,10 @@ class Scene(nn.Module):
                 self.residual = ResidualField(config)
         if config.single_mlp:
             with torch_stream(seed, "init.single"):
-                self.single = SingleMLP(config)
+                self.single = SingleMLP(config, initial_log_scale)
         elif config.canonical:
             with torch_stream(seed, "init.static"):
-                self.static = StaticMLP(config)
+                self.static = StaticMLP(config, initial_log_scale)
         if not config.single_mlp and config.deformation != "none":
             with torch_stream(seed, "init.deformation"):
                 self.deformation = DeformationNetwork(config)
@@ -134,6 +142,8 @@ class Scene(nn.Module):
         slot_indices = candidates[rendered // slots] * slots + rendered % slots
 
         children = gather(scaffold, slot_indices)
+        if self.log_unit is not None:
+            children = replace(children, anchor_log_scales=torch.full_like(children.canonical_means, self.log_unit))
         uids = scaffold.child_uids(slot_indices)
         extent = float(self.extent)
         compositions = []
@@ -223,7 +233,8 @@ class Scene(nn.Module):
         time_rows = torch.tensor(times, dtype=canonical_means.dtype).unsqueeze(-1)
         if self.config.deformation == "anchor":
             anchors, owners = torch.unique(slot_indices // self.scaffold.slots, return_inverse=True)
-            shared = self.deformation(self.scaffold.anchors.index_select(0, anchors) / self.extent, time_rows)
+            positions = self._network_positions(self.scaffold.anchors.index_select(0, anchors))
+            shared = self.deformation(positions, time_rows)
             return [raw.index_select(0, owners) for raw in shared.unbind(0)]
         return list(self.deformation(self._network_positions(canonical_means), time_rows).unbind(0))
 

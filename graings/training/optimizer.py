@@ -28,6 +28,7 @@ MOMENTUM_OF = "momentum"
 
 # Which group a parameter belongs to, by the head of its name in the scene.
 _GROUPS = {
+    "scaffold.anchors": "anchors",
     "scaffold.offsets": "offsets",
     "scaffold.features": "features",
     "scaffold.log_scales": "log_scales",
@@ -72,6 +73,7 @@ class Optimizer:
         self.scene = scene
         self.rates: RatesConfig = config.rates
         self.batch_factor = views**BATCH_POWER
+        self.extent = float(scene.extent)
         self.iterations = config.iterations
         self.joint_from = joint_from
         self.damping = 1.0
@@ -104,6 +106,8 @@ class Optimizer:
         """Apply the gradients at the rates of `iteration`."""
         for group in self.adam.param_groups:
             group["lr"] = self.damping * self.rate(group["name"], iteration)
+            if group["name"] == "anchors":
+                group["lr"] *= self.extent
         self.adam.step()
         self.muon.step([self.damping * self.rate(MATRICES, iteration, like=group) for group in self._muon_groups])
         self.clear()

@@ -48,9 +48,10 @@ def regularisers(
     if len(first.children) == 0:
         return total
     if first.deformation is not None and config.temporal > 0 and len(times) > 1:
-        share = config.temporal_share
-        generator = streams["time_pairs"]
-        total = total + config.temporal * _temporal(scene, first, moments[0], times, share, generator)
+        # The sampled pair stands for all pairs, or for their mean.
+        pairs = len(times) - 1 if config.temporal_sum else 1
+        share, generator = config.temporal_share, streams["time_pairs"]
+        total = total + config.temporal * pairs * _temporal(scene, first, moments[0], times, share, generator)
     if config.rigidity > 0:
         total = total + config.rigidity * _rigidity(compositions, float(scene.extent), streams["child_pairs"])
     for one in compositions:

@@ -176,7 +176,9 @@ class Trainer(TrainerState):
         scaffold, config = self.scene.scaffold, self.config.guard
         problem = self.guard.problem()
         end_of_pass = not self.views.upcoming(self.iteration)
-        if self.collapse.observe(drawn, scaffold.count * scaffold.slots, difference, last_of_pass=end_of_pass):
+        slots = scaffold.count * scaffold.slots
+        collapsed = self.collapse.observe(drawn, slots, difference, last_of_pass=end_of_pass)
+        if collapsed and not config.skip_only:
             problem = problem or self._non_finite()
             if problem is None and not self.collapse.raised:
                 shift = raise_opacity(self.scene)
@@ -212,7 +214,7 @@ class Trainer(TrainerState):
 
     def _roll_back(self, problem: str) -> RolledBack:
         """Restore a snapshot and continue with lower rates and another order of views. The iterations are spent."""
-        if self.guard.rollbacks >= self.config.guard.rollbacks:
+        if not self.guard.may_roll_back:
             raise DivergedError(
                 f"Training diverged at iteration {self.run_iteration} after "
                 f"{self.guard.rollbacks} rollbacks: {problem}. The best model is kept. "

@@ -44,11 +44,11 @@ def folder(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_unnamed_rows_that_equal_the_full_model_are_left_out(capture: Path, tmp_path: Path) -> None:
-    whole = ablation(tmp_path, capture, preset="paper", settings={**SETTINGS, "batch": 1})
+    whole = ablation(tmp_path, capture, preset="long", settings={**SETTINGS, "batch": 1})
     assert [row.name for row in whole.rows] == [name for name in NAMES if name != "no_rigidity"]
     assert ["no_rigidity" in note and "left out" in note for note in whole.notes] == [True]
     with pytest.raises(ConfigError, match="no_rigidity"):
-        ablation(tmp_path, capture, preset="paper", settings={**SETTINGS, "batch": 1}, rows=("no_rigidity",))
+        ablation(tmp_path, capture, preset="long", settings={**SETTINGS, "batch": 1}, rows=("no_rigidity",))
 
 
 def everything_in(folder: Path) -> dict[str, bytes]:

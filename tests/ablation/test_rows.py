@@ -85,7 +85,7 @@ def test_a_row_that_would_be_the_full_model_over_again_is_refused(name: str, key
 
 def test_rigidity_between_the_views_of_a_step_needs_two() -> None:
     with pytest.raises(ConfigError, match=r"batch: is 1.*no_rigidity.*--rows"):
-        row_config(chosen_rows(["no_rigidity"])[0], "paper", {}, 0)
+        row_config(chosen_rows(["no_rigidity"])[0], "long", {}, 0)
 
 
 def test_a_seed_among_the_settings_is_refused() -> None:

@@ -213,7 +213,7 @@ def test_a_read_only_path_is_named_with_a_remedy(run: Path, capsys: pytest.Captu
         (["train", "CAPTURE", "-o", "RUN", "--set", "iterations=0"], 2, "iterations"),
         (["train", "CAPTURE", "-o", "RUN", "--set", "no.such=1"], 2, "no"),
         (["train", "CAPTURE", "-o", "RUN", "--set", "iterations"], 2, "key=value"),
-        (["train", "CAPTURE", "-o", "RUN", "--preset", "best"], 2, "draft, standard, fine, paper"),
+        (["train", "CAPTURE", "-o", "RUN", "--preset", "best"], 2, "draft, standard, fine, long, paper"),
         (["train", "CAPTURE", "-o", "RUN", "--resume", "--set", "seed=1"], 2, "keeps its options"),
         (["train", "-o", "RUN"], 2, "capture"),
         (["train", "ABSENT", "-o", "RUN"], 65, "absent"),
@@ -265,7 +265,8 @@ def test_options_are_listed_with_value_bounds_and_help(
     monkeypatch.setenv("COLUMNS", "200")
     assert graings("options", "--preset", "draft") == 0
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.strip()}
-    assert lines["density.max_anchors"].split()[:4] == ["density.max_anchors", "1600", "≥", "16"]
+    assert lines["density.max_anchors"].split()[:5] == ["density.max_anchors", "1600", "*", "≥", "16"]
+    assert lines["density.levels"].split()[:4] == ["density.levels", "3", "≥", "1,"]
     assert "Maximum number of anchors after growth" in lines["density.max_anchors"]
     assert lines["rates.deformation"].split() == ["rates.deformation", "[0.002,", "5e-05]", "≥", "0", "DeformNet."]
 
@@ -285,7 +286,13 @@ def test_options_as_json_are_the_schema(capsys: pytest.CaptureFixture[str]) -> N
     assert graings("options", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     schedules = {name: (preset["iterations"], preset["batch"]) for name, preset in document["presets"].items()}
-    assert schedules == {"draft": (1_100, 4), "standard": (5_000, 4), "fine": (15_000, 4), "paper": (30_000, 1)}
+    assert schedules == {
+        "draft": (1_100, 4),
+        "standard": (5_000, 4),
+        "fine": (15_000, 4),
+        "long": (30_000, 1),
+        "paper": (30_000, 1),
+    }
     assert "iterations" in document["schema"]["properties"]
 
 

@@ -16,7 +16,7 @@ TIMES = [index / 20 for index in range(21)]
 
 
 def test_the_window_widens_from_the_middle_to_the_whole_clip() -> None:
-    window = TimeWindow(make_config("paper", {"time_window_until": 11_000, "warmup": 1_000}), TIMES, 0.2)
+    window = TimeWindow(make_config("long", {"time_window_until": 11_000, "warmup": 1_000}), TIMES, 0.2)
 
     def taking_part(iteration: int) -> list[float]:
         return [time for view, time in enumerate(TIMES) if window.has(view, iteration)]
@@ -28,7 +28,7 @@ def test_the_window_widens_from_the_middle_to_the_whole_clip() -> None:
 
 
 def test_a_window_narrower_than_the_frame_interval_keeps_the_middle_view() -> None:
-    window = TimeWindow(make_config("paper"), [0.0, 0.4, 1.0], 1e-6)
+    window = TimeWindow(make_config("long"), [0.0, 0.4, 1.0], 1e-6)
     assert [window.has(view, 0) for view in range(3)] == [False, True, False]
 
 

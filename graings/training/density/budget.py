@@ -48,8 +48,9 @@ def bytes_per_anchor(config: SceneConfig, views: int) -> int:
 
 
 def most_anchors(config: TrainConfig) -> int:
-    """Anchors that growth may reach: `density.max_anchors`, or what memory holds if that is less."""
-    return min(config.density.max_anchors, affordable_anchors(config.scene, config.batch, config.density.memory_mb))
+    """Anchors that growth may reach: `density.max_anchors`, or what memory holds if that is less or there is none."""
+    affordable = affordable_anchors(config.scene, config.batch, config.density.memory_mb)
+    return affordable if config.density.max_anchors is None else min(config.density.max_anchors, affordable)
 
 
 def affordable_anchors(config: SceneConfig, views: int, memory_mb: int) -> int:

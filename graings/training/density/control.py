@@ -35,7 +35,9 @@ class DensityControl:
     """Grows and prunes one scene. `voxel_size` is that of the finest cells, normalised."""
 
     def __init__(self, config: TrainConfig, scene: Scene, voxel_size: float) -> None:
-        self.config = config.density.model_copy(update={"max_anchors": most_anchors(config)})
+        self.most = most_anchors(config)
+        self.config = config.density.model_copy(update={"max_anchors": self.most})
+        self.makes_room = config.density.max_anchors is not None
         self.scaled = config.scaled
         self.voxel_size = voxel_size
         self.next_uid = scene.scaffold.count
@@ -84,10 +86,10 @@ class DensityControl:
         """
         events: list[Event] = []
         # Faint anchors would use up the budget for good: what is not drawn gets no gradient and does not recover.
-        if scene.scaffold.count > NEAR_BUDGET * self.config.max_anchors:
+        if self.makes_room and scene.scaffold.count > NEAR_BUDGET * self.most:
             visited = float((self.statistics.visits > self.config.prune_min_views).double().mean())
             events = self.prune(iteration, scene, optimizer)
-            if visited > MIN_OBSERVED_FRACTION and scene.scaffold.count > self.config.max_anchors:
+            if visited > MIN_OBSERVED_FRACTION and scene.scaffold.count > self.most:
                 events += self._thin(iteration, scene, optimizer, generator)
         grown = growth.grow(
             scene.scaffold,
@@ -101,7 +103,7 @@ class DensityControl:
         self.statistics.reset_grown(self.config.min_observations)
         if grown.capped:
             anchors = scene.scaffold.count + len(grown)
-            events.append(GrowthCapped(iteration=iteration, anchors=anchors, max_anchors=self.config.max_anchors))
+            events.append(GrowthCapped(iteration=iteration, anchors=anchors, max_anchors=self.most))
         if len(grown) > 0:
             optimizer.append(grown.rows)
             self.statistics.resize(append=len(grown))
@@ -122,7 +124,7 @@ class DensityControl:
 
     def _thin(self, iteration: int, scene: Scene, optimizer: Optimizer, generator: torch.Generator) -> list[Event]:
         """Make room for growth where the initial anchors are more than the budget; returns what happened."""
-        count, most = scene.scaffold.count, max(2, int(THINNED_FRACTION * self.config.max_anchors))
+        count, most = scene.scaffold.count, max(2, int(THINNED_FRACTION * self.most))
         keep, wider = growth.thin_out(scene.scaffold, self.statistics, most, generator)
         with torch.no_grad():
             scene.scaffold.log_scales.add_(wider.unsqueeze(-1))

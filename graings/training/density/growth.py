@@ -19,8 +19,7 @@ from graings.training.density.statistics import DensityStatistics
 # Never prune below this many anchors.
 MIN_ANCHORS = 16
 
-# At most this share of the anchors, or MIN_GROWTH if that is more, is added at once.
-MAX_GROWTH = 0.1
+# `max_growth` of few anchors would be next to nothing: so many may be added at once in any case.
 MIN_GROWTH = 1_000
 
 # A cell of the next finer level is this many times smaller.
@@ -61,11 +60,12 @@ def grow(
     """
     observed = statistics.drawn > config.min_observations
     mean = torch.where(observed, statistics.gradient / statistics.drawn.clamp_min(1), 0.0).flatten()
+    anchors = scaffold.anchors.detach()
     positions = (
-        scaffold.anchors.unsqueeze(1) + scaffold.log_scales.detach().exp().unsqueeze(1) * scaffold.offsets.detach()
+        anchors.unsqueeze(1) + scaffold.log_scales.detach().exp().unsqueeze(1) * scaffold.offsets.detach()
     ).flatten(0, 1)
     fresh: dict[str, list[Tensor]] = {"anchors": [], "features": [], "log_scales": [], "score": [], "parent": []}
-    existing = scaffold.anchors
+    existing = anchors
     for level in range(config.levels):
         cell = voxel_size * max(1, LEVEL_DIVISOR ** (config.levels - 1 - level))
         kept = torch.rand(len(mean), generator=generator) > 0.5 ** (level + 1)
@@ -90,7 +90,7 @@ def grow(
         parent = torch.full((count,), len(mean), dtype=torch.int64)
         best = mean[chosen] == score[member]
         parent = parent.scatter_reduce(0, member[best], chosen[best], "amin") // scaffold.slots
-        nodes = (cells[free].double() * cell).to(scaffold.anchors.dtype)
+        nodes = (cells[free].double() * cell).to(anchors.dtype)
         fresh["anchors"].append(nodes)
         fresh["features"].append(features)
         fresh["log_scales"].append(torch.full((count, 3), math.log(cell)))
@@ -100,8 +100,11 @@ def grow(
     if not fresh["anchors"]:
         return Growth(_empty_rows(scaffold), capped=False)
     new = {name: torch.cat(parts) for name, parts in fresh.items()}
-    room = max(0, config.max_anchors - scaffold.count)
-    room = min(room, max(MIN_GROWTH, int(MAX_GROWTH * scaffold.count)))
+    room = len(new["score"])
+    if config.max_anchors is not None:
+        room = min(room, max(0, config.max_anchors - scaffold.count))
+    if config.max_growth is not None:
+        room = min(room, max(MIN_GROWTH, int(config.max_growth * scaffold.count)))
     order = torch.argsort(new["score"], descending=True, stable=True)[:room].sort().values
     return Growth(
         {

@@ -83,7 +83,7 @@ class Guard:
             return StepCheck(non_finite)
         self.consecutive = 0
         self.trend.add(float(loss))
-        limits = self._limits(gradients, norms)
+        limits = {} if self.config.skip_only else self._limits(gradients, norms)
         self.clipped += bool(limits)
         return StepCheck(None, limits)
 
@@ -93,7 +93,12 @@ class Guard:
             return f"{self._last} was not finite in {self.consecutive} steps in a row"
         if len(self._recent) >= MAX_RECENT_SKIPS:
             return f"{len(self._recent)} of the last {MEMORY} steps were not finite, the last because of {self._last}"
-        return self.trend.problem()
+        return None if self.config.skip_only else self.trend.problem()
+
+    @property
+    def may_roll_back(self) -> bool:
+        """Whether another return to a snapshot is allowed."""
+        return not self.config.skip_only and self.rollbacks < self.config.rollbacks
 
     def rolled_back(self, before: Guard) -> None:
         """This guard was restored from a snapshot; take over the counts of the guard `before` the rollback."""
