@@ -38,9 +38,9 @@ PRESET = "draft"
 OPTIONS: dict[str, Any] = {"iterations": 800}
 SCENE = "walker"
 SIZE = 200
-VIEWS = 100
+VIEWS = 150
 
-TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
+TIMES = (0.0, 0.2, 0.4, 0.6, 0.8)
 VIEWPOINTS: dict[str, dict[str, object]] = {
     "val0": {"camera": "val:0"},
     "orbit30": {"azimuth": 30, "width": 400, "height": 400},
