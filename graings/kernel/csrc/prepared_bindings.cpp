@@ -1,0 +1,75 @@
+// Python bindings of prepared.hpp.
+#include "prepared.hpp"
+
+#include "arrays.hpp"
+
+namespace {
+
+template <class R>
+void bind(nb::module_& m) {
+    m.def("activate", [](int kind, In<R> x, Out<R> out, int threads) {
+        R* to = checked(out, x.size(), "out");
+        if (kind != graings::kSigmoid && kind != graings::kTanh) throw std::invalid_argument("kind must be 0 (sigmoid) or 1 (tanh)");
+        nb::gil_scoped_release release;
+        graings::activate<R>(graings::Activation(kind), int64_t(x.size()), x.data(), to, threads);
+    });
+    m.def("directions", [](In<R> position, In<double> eye, double nearest, Out<R> out, int threads) {
+        const double* from = checked(eye, 3, "eye");
+        const size_t rows = position.size() / 3;
+        R* to = checked(out, 3 * rows, "out");
+        nb::gil_scoped_release release;
+        graings::directions<R>(int64_t(rows), position.data(), from, nearest, to, threads);
+    });
+    m.def("move", [](In<R> hidden, In<R> rest, In<R> weights, In<R> bias, double extent, double change, double low, double high, int64_t children, In<int64_t> rows,
+                     Out<R> mean, Out<R> quat, Out<R> log_scale, int threads) {
+        const size_t blocks = size_t(children + graings::kMoving - 1) / graings::kMoving, width = weights.size() / graings::kOffsets, drawn = rows.size();
+        const graings::MoveArgs<R> args{int64_t(width),
+                                        checked(hidden, blocks * width * graings::kMoving, "hidden"),
+                                        checked(rest, blocks * graings::kOffsets * graings::kMoving, "rest"),
+                                        checked(weights, width * graings::kOffsets, "weights"),
+                                        checked(bias, graings::kOffsets, "bias"),
+                                        R(extent), R(change), R(low), R(high),
+                                        rows.data(),
+                                        checked(mean, 3 * drawn, "mean"), checked(quat, 4 * drawn, "quat"), checked(log_scale, 3 * drawn, "log_scale")};
+        nb::gil_scoped_release release;
+        graings::move<R>(args, children, int64_t(drawn), threads);
+    });
+    m.def("paint", [](In<R> position, std::optional<In<R>> normals, int degree, In<R> hidden, std::vector<In<R>> weights, std::vector<In<R>> biases, int residual_degree,
+                      std::optional<In<R>> residual_hidden, std::vector<In<R>> residual_weights, std::vector<In<R>> residual_biases, std::optional<In<R>> time_only,
+                      double bound, In<double> eye, double nearest, In<int64_t> children, Out<R> colors, int threads) {
+        const int64_t anchors = int64_t(position.size() / 3);
+        graings::ColorNetworks<R> in{anchors, 0, position.data(), checked(normals, position.size(), "normals"), degree, {}, residual_degree, {}, nullptr, bound};
+        const auto head = [&](const In<R>& shared, const std::vector<In<R>>& w, const std::vector<In<R>>& b, size_t inputs) {
+            if (w.size() != 2 || b.size() != 2 || w[0].shape(1) != inputs) throw std::invalid_argument("a colour network has two layers, the first of all harmonics");
+            graings::Network<R> result;
+            result.widths = {int64_t(inputs), int64_t(w[0].shape(0)), int64_t(w[1].shape(0))};
+            for (size_t l = 0; l < 2; l++) {
+                const size_t in = size_t(result.widths[l]), out = size_t(result.widths[l + 1]);
+                result.weights.push_back(checked(w[l], in * out, "weight")), result.biases.push_back(checked(b[l], out, "bias"));
+            }
+            result.groups = anchors, result.shared = checked(shared, size_t(anchors * result.widths[1]), "hidden");
+            if (result.widths[2] % 3) throw std::invalid_argument("a colour network has three outputs per slot");
+            return result;
+        };
+        in.canonical = head(hidden, weights, biases, harmonics_of(degree) * (normals ? 2 : 1));
+        in.slots = in.canonical.widths[2] / 3;
+        if (residual_degree) {
+            if (!residual_hidden) throw std::invalid_argument("the residual network needs its hidden layer");
+            in.residual = head(*residual_hidden, residual_weights, residual_biases, harmonics_of(residual_degree));
+            if (in.residual.widths[2] != 3 * in.slots) throw std::invalid_argument("colour and residual must have the same slots");
+        }
+        in.time_only = checked(time_only, size_t(4 * anchors * in.slots), "time_only");
+        const double* from = checked(eye, 3, "eye");
+        R* out = checked(colors, 3 * children.size(), "colors");
+        nb::gil_scoped_release release;
+        graings::paint<R>(in, from, nearest, int64_t(children.size()), children.data(), out, threads);
+    });
+}
+
+}  // namespace
+
+void bind_prepared(nb::module_& m);
+void bind_prepared(nb::module_& m) {
+    bind<float>(m);
+    bind<double>(m);
+}

@@ -1,0 +1,150 @@
+"""PreparedScene: a trained scene with everything evaluated that depends on neither time nor view.
+
+A `Scene` evaluates its networks anew for every composition, which training needs. A prepared scene has evaluated them
+once, without gradients, and composes the same Gaussians to the bit: it calls the same functions, or kernels whose sums
+have the same order (tests/scene/test_prepared.py).
+
+- Once: canonical geometry, the hidden units of a factorized DeformNet, canonical opacities, and the features' part of
+  the heads of colour and residual.
+- For each time: opacities, which children are rendered, and their geometry. The last times are kept.
+- For each view: colours.
+
+Children that no time and no view can show are left out. A score is o = o_can + Delta o with |Delta o| <= eta, and
+rounding is monotone: where o_can + eta, rounded, is at most 1/255, so is every o. With `opacity_view` the bound of
+o_can over all directions takes its place, enlarged by a margin for its rounding.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from graings import constants
+from graings.gaussians import Gaussians
+from graings.scene.activations import tanh
+from graings.scene.children import Geometry
+from graings.scene.prepared_colors import PreparedColors
+from graings.scene.prepared_geometry import prepared_geometry
+from graings.scene.scene import Composed, Scene
+
+# Times of which geometry and opacities are kept: players show one time from many views, or a few times again.
+KEPT_TIMES: Final = 4
+
+# Covers the rounding of `highest_opacity_logits`, whose sums have another order than the scores they bound.
+_OPACITY_MARGIN: Final = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Instant:
+    """What all views of one time share."""
+
+    rendered: Int64[Tensor, " gaussian"]  # slots among those of the kept anchors
+    opacities: Float[Tensor, " gaussian"]
+    geometry: Geometry
+    time_only: Float[Tensor, "anchor child 4"] | None  # residual before its bound, where it has no direction
+
+
+class PreparedScene:
+    """`scene` as it is now, for many views of it; valid until a parameter of `scene` changes.
+
+    May be used from several threads.
+    """
+
+    @torch.inference_mode()
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        scaffold, slots = scene.scaffold, scene.scaffold.slots
+        self._residual = scene.residual if scene.temporal else None
+        shown = possible_children(scene)
+        self._anchors = shown.any(1).nonzero().squeeze(-1)
+        self._features = scaffold.features.index_select(0, self._anchors)
+        self._opacity_offsets = scaffold.opacity_offsets.index_select(0, self._anchors).unsqueeze(-1)
+        self._opacities = None if scene.config.opacity_view else self._canonical_opacities(None)
+        kept = shown.index_select(0, self._anchors).flatten().nonzero().squeeze(-1)
+        self._slots = self._anchors[kept // slots] * slots + kept % slots
+        self._rows = torch.full((len(self._anchors) * slots,), -1)  # of `_slots`, for each slot of the kept anchors
+        self._rows[kept] = torch.arange(len(kept))
+        self._uids = scaffold.child_uids(self._slots)
+        self._geometry = prepared_geometry(scene, self._slots)
+        self._colors = PreparedColors(scene, self._anchors, self._features)
+        self._instants: OrderedDict[float, _Instant] = OrderedDict()
+        self._guard = threading.Lock()
+
+    @property
+    def children(self) -> int:
+        """Number of children that some time and view may show."""
+        return len(self._slots)
+
+    @torch.inference_mode()
+    def compose(self, eye: ArrayLike, time: float) -> Composed:
+        """The Gaussians at `time` in [0, 1] for the camera centre `eye` [3] (normalised units)."""
+        instant = self._instant(eye, time)
+        rows = self._rows.index_select(0, instant.rendered)
+        means, quats, log_scales = instant.geometry
+        colors = self._colors.of(eye, time, instant.rendered, instant.time_only)
+        return Composed(
+            gaussians=Gaussians(
+                means=means,
+                quats=quats,
+                log_scales=log_scales,
+                opacities=instant.opacities,
+                colors=colors,
+                uids=self._uids.index_select(0, rows),
+            ),
+            children=self._slots.index_select(0, rows),
+            blur=self.scene.config.blur,
+            sampling=self.scene.sampling,
+        )
+
+    def _instant(self, eye: ArrayLike, time: float) -> _Instant:
+        if self._opacities is None:  # opacities, and with them the choice of children, depend on the view
+            anchors = self.scene.directions(eye).index_select(0, self._anchors)
+            return self._instant_with(self._canonical_opacities(anchors), time)
+        with self._guard:
+            known = self._instants.get(time)
+            if known is not None:
+                self._instants.move_to_end(time)
+                return known
+        instant = self._instant_with(self._opacities, time)
+        with self._guard:
+            self._instants[time] = instant
+            while len(self._instants) > KEPT_TIMES:
+                self._instants.popitem(last=False)
+        return instant
+
+    def _instant_with(self, opacities: Float[Tensor, "anchor child"], time: float) -> _Instant:
+        """The instant with these canonical `opacities`."""
+        time_only = None
+        if self._residual is not None:
+            changes, time_only = self._colors.changes(self._residual, time)
+            opacities = opacities + self._residual.bounded(changes)
+        scores = opacities.flatten()
+        rendered = (scores > constants.ALPHA_MIN).nonzero().squeeze(-1)
+        geometry = self._geometry.at(time, self._rows.index_select(0, rendered))
+        return _Instant(rendered, scores.index_select(0, rendered), geometry, time_only)
+
+    def _canonical_opacities(self, directions: Float[Tensor, "anchor 3"] | None) -> Float[Tensor, "anchor child"]:
+        """o_can (Eq. 11) of every slot of the kept anchors."""
+        directions = self._features.new_empty(len(self._features), 3) if directions is None else directions
+        return tanh(self.scene.appearance.opacity_logits(self._features, directions) + self._opacity_offsets)
+
+
+def possible_children(scene: Scene) -> Bool[Tensor, "anchor child"]:
+    """Which child slots some time and some view may show; see the module for the proof."""
+    scaffold, residual = scene.scaffold, scene.residual if scene.temporal else None
+    with torch.no_grad():
+        logits = scene.appearance.highest_opacity_logits(scaffold.features)
+        if not scene.config.opacity_view:
+            logits = scene.appearance.opacity_logits(scaffold.features, scaffold.anchors)
+        highest = tanh(logits + scaffold.opacity_offsets.unsqueeze(-1))
+        if residual is not None:
+            highest = highest + residual.scale
+        margin = _OPACITY_MARGIN if scene.config.opacity_view else 0.0
+        return highest + margin > constants.ALPHA_MIN
