@@ -27,7 +27,7 @@ from graings.scene.perceptron import GroupBias, perceptron, weights_and_biases
 class ColorPart:
     """What the colour head needs of each anchor's feature: the same for all views."""
 
-    hidden: Float[Tensor, "anchor width"]  # the feature's part of the first layer, bias included
+    hidden: GroupBias  # the feature's part of the first layer, bias included; a group for each anchor
     normals: Float[Tensor, "anchor 3"] | None  # at which the viewing direction is reflected
 
 
@@ -63,7 +63,7 @@ class CanonicalAppearance(nn.Module):
         first = self.color[0]
         assert isinstance(first, nn.Linear)
         hidden = perceptron(features, [first.weight[:, : features.shape[-1]]], [first.bias])
-        return ColorPart(hidden, None if self.normal is None else self.normal(features))
+        return ColorPart(_per_row(hidden), None if self.normal is None else self.normal(features))
 
     def color_layers(self, part: ColorPart) -> tuple[list[Tensor], list[Tensor]]:
         """Weights and biases that remain of the colour head once the features' part of its first layer is known."""
@@ -77,7 +77,7 @@ class CanonicalAppearance(nn.Module):
     ) -> Float[Tensor, "gaussian 3"]:
         """c_can (Eq. 11) of the given flat child slots (anchor * k + child)."""
         inputs = direction_encoding(directions, self.color_sh_degree, part.normals)
-        raw = perceptron(inputs, *self.color_layers(part), shared=_per_row(part.hidden))
+        raw = perceptron(inputs, *self.color_layers(part), shared=part.hidden)
         return sigmoid(raw.view(-1, 3).index_select(0, children))
 
     def opacity_logits(
@@ -116,10 +116,10 @@ class TemporalHead(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def feature_part(self, features: Float[Tensor, "row feature"]) -> Float[Tensor, "row width"]:
+    def feature_part(self, features: Float[Tensor, "row feature"]) -> GroupBias:
         """The features' part of the hidden layer, bias included: the same for all times and directions."""
         weight = self.from_feature.weight[:, : features.shape[-1]]
-        return perceptron(features, [weight], [self.from_feature.bias])
+        return _per_row(perceptron(features, [weight], [self.from_feature.bias]))
 
     def layers(self, others: int, encoded_time: Float[Tensor, " time"]) -> tuple[list[Tensor], list[Tensor]]:
         """Weights and biases that remain at a time once the part of the features is known; `others`: further inputs."""
@@ -128,21 +128,21 @@ class TemporalHead(nn.Module):
 
     def predict(
         self,
-        part: Float[Tensor, "row width"],
+        part: GroupBias,
         encoded_time: Float[Tensor, " time"],
         others: Float[Tensor, "row other"] | None = None,
     ) -> Float[Tensor, "row output"]:
         """The output for each row of `feature_part`, with further inputs, at the time encoded by `encoded_time`."""
-        inputs = part.new_empty(len(part), 0) if others is None else others
-        return perceptron(inputs, *self.layers(inputs.shape[1], encoded_time), shared=_per_row(part))
+        inputs = part.values.new_empty(len(part.values), 0) if others is None else others
+        return perceptron(inputs, *self.layers(inputs.shape[1], encoded_time), shared=part)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualPart:
     """What the residual needs of each anchor's feature: the same for all times and views."""
 
-    time_only: Float[Tensor, "anchor width"]
-    seeing: Float[Tensor, "anchor width"] | None
+    time_only: GroupBias
+    seeing: GroupBias | None
 
 
 class ResidualField(TemporalHead):

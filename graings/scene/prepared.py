@@ -19,18 +19,18 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from graings import constants
+from graings import constants, kernel
 from graings.gaussians import Gaussians
 from graings.scene.activations import tanh
 from graings.scene.children import Geometry
-from graings.scene.prepared_colors import PreparedColors
+from graings.scene.prepared_colors import Changes, PreparedColors
 from graings.scene.prepared_geometry import prepared_geometry
 from graings.scene.scene import Composed, Scene
 
@@ -45,10 +45,19 @@ _OPACITY_MARGIN: Final = 1e-4
 class _Instant:
     """What all views of one time share."""
 
-    rendered: Int64[Tensor, " gaussian"]  # slots among those of the kept anchors
-    opacities: Float[Tensor, " gaussian"]
+    rendered: _Rendered
     geometry: Geometry
-    time_only: Float[Tensor, "anchor child 4"] | None  # residual before its bound, where it has no direction
+    changes: Changes | None
+
+
+class _Rendered(NamedTuple):
+    """The children that some view shows at one time, in the order of the scene."""
+
+    rows: Int64[Tensor, " gaussian"]  # among those that any time shows
+    slots: Int64[Tensor, " gaussian"]  # among those of the kept anchors
+    children: Int64[Tensor, " gaussian"]  # flat slots (anchor * k + child) of the scene
+    uids: Int64[Tensor, " gaussian"]
+    opacities: Float[Tensor, " gaussian"]
 
 
 class PreparedScene:
@@ -67,10 +76,8 @@ class PreparedScene:
         self._features = scaffold.features.index_select(0, self._anchors)
         self._opacity_offsets = scaffold.opacity_offsets.index_select(0, self._anchors).unsqueeze(-1)
         self._opacities = None if scene.config.opacity_view else self._canonical_opacities(None)
-        kept = shown.index_select(0, self._anchors).flatten().nonzero().squeeze(-1)
-        self._slots = self._anchors[kept // slots] * slots + kept % slots
-        self._rows = torch.full((len(self._anchors) * slots,), -1)  # of `_slots`, for each slot of the kept anchors
-        self._rows[kept] = torch.arange(len(kept))
+        self._kept = shown.index_select(0, self._anchors).flatten().nonzero().squeeze(-1)
+        self._slots = self._anchors[self._kept // slots] * slots + self._kept % slots
         self._uids = scaffold.child_uids(self._slots)
         self._geometry = prepared_geometry(scene, self._slots)
         self._colors = PreparedColors(scene, self._anchors, self._features)
@@ -86,19 +93,17 @@ class PreparedScene:
     def compose(self, eye: ArrayLike, time: float) -> Composed:
         """The Gaussians at `time` in [0, 1] for the camera centre `eye` [3] (normalised units)."""
         instant = self._instant(eye, time)
-        rows = self._rows.index_select(0, instant.rendered)
-        means, quats, log_scales = instant.geometry
-        colors = self._colors.of(eye, time, instant.rendered, instant.time_only)
+        rendered, (means, quats, log_scales) = instant.rendered, instant.geometry
         return Composed(
             gaussians=Gaussians(
                 means=means,
                 quats=quats,
                 log_scales=log_scales,
-                opacities=instant.opacities,
-                colors=colors,
-                uids=self._uids.index_select(0, rows),
+                opacities=rendered.opacities,
+                colors=self._colors.of(eye, rendered.slots, instant.changes),
+                uids=rendered.uids,
             ),
-            children=self._slots.index_select(0, rows),
+            children=rendered.children,
             blur=self.scene.config.blur,
             sampling=self.scene.sampling,
         )
@@ -121,14 +126,23 @@ class PreparedScene:
 
     def _instant_with(self, opacities: Float[Tensor, "anchor child"], time: float) -> _Instant:
         """The instant with these canonical `opacities`."""
-        time_only = None
-        if self._residual is not None:
-            changes, time_only = self._colors.changes(self._residual, time)
-            opacities = opacities + self._residual.bounded(changes)
-        scores = opacities.flatten()
-        rendered = (scores > constants.ALPHA_MIN).nonzero().squeeze(-1)
-        geometry = self._geometry.at(time, self._rows.index_select(0, rendered))
-        return _Instant(rendered, scores.index_select(0, rendered), geometry, time_only)
+        changes = self._colors.changes(time)
+        rendered = self._rendered(opacities, changes)
+        return _Instant(rendered, self._geometry.at(time, rendered.rows), changes)
+
+    def _rendered(self, opacities: Float[Tensor, "anchor child"], changes: Changes | None) -> _Rendered:
+        """The children whose score, canonical and residual, exceeds the rendering threshold."""
+        count = self.children
+        found = _Rendered(*(torch.empty_like(self._kept) for _ in range(4)), opacities.new_empty(count))
+        change: tuple[Any, ...] = (None, 1, 0, 0.0)
+        if changes is not None and self._residual is not None:
+            width = changes.values.shape[-1]
+            change = (changes.values, width, width - 1, self._residual.scale)
+        slots = (self._kept, self._slots, self._uids)
+        number = kernel.kernel().choose(
+            *slots, opacities, *change, constants.ALPHA_MIN, *found, kernel.thread_count()
+        )
+        return _Rendered(*(part[:number] for part in found))
 
     def _canonical_opacities(self, directions: Float[Tensor, "anchor 3"] | None) -> Float[Tensor, "anchor child"]:
         """o_can (Eq. 11) of every slot of the kept anchors."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 from torch.nn import functional
 
@@ -79,13 +80,12 @@ class _Factorized(PreparedGeometry):
         children = gather(scene.scaffold, slots)
         static, means = scene.static, children.canonical_means
         canonical = default_geometry(means) if static is None else static(scene.scaffold.features, children)
-        self._count = len(slots)
-        self._hidden = in_blocks(deformation.hidden_units(scene.network_positions(means)))
+        self._hidden = ActiveUnits.of(deformation.hidden_units(scene.network_positions(means)))
         self._rest = in_blocks(unmoved(canonical, children))
 
     def at(self, time: float, rows: Tensor) -> Geometry:
         weights, bias = self._deformation.output_layer(self._rest.new_tensor([[time]]))
-        return move(self._hidden, self._rest, weights, bias, self._extent, self._count, rows)
+        return move(self._hidden, self._rest, weights, bias, self._extent, rows)
 
 
 def unmoved(canonical: Float[Tensor, "child 7"], children: Children) -> Float[Tensor, "child 10"]:
@@ -100,22 +100,41 @@ def in_blocks(rows: Float[Tensor, "child width"]) -> Float[Tensor, "block width 
     return padded.view(-1, BLOCK, rows.shape[1]).transpose(1, 2).contiguous()
 
 
+class ActiveUnits(NamedTuple):
+    """Hidden units in blocks of `BLOCK` children, without those that ReLU makes zero in a whole block.
+
+    A third of them, because children near each other share theirs. They add exactly nothing to a sum.
+    """
+
+    values: Float[Tensor, "active 16"]
+    begin: Int64[Tensor, " _"]  # of each block in `values`, and the end of the last
+    units: Int32[Tensor, " active"]  # which hidden unit each row of `values` is
+
+    @staticmethod
+    def of(hidden: Float[Tensor, "child width"]) -> ActiveUnits:
+        """Those of `hidden`."""
+        blocks = in_blocks(hidden)
+        active = (blocks != 0).any(2)
+        begin = functional.pad(active.sum(1).cumsum(0), (1, 0))
+        return ActiveUnits(blocks[active], begin, active.nonzero()[:, 1].int())
+
+
 def move(
-    hidden: Float[Tensor, "block width 16"],
+    hidden: ActiveUnits,
     rest: Float[Tensor, "block 10 16"],
     weights: Float[Tensor, "10 width"],
     bias: Float[Tensor, " 10"],
     extent: float,
-    count: int,
     rows: Int64[Tensor, " gaussian"],
 ) -> Geometry:
     """Geometry (Eq. 10) of the children `rows` with the offsets `weights` @ hidden units + `bias`.
 
-    `hidden` and `rest` (`unmoved`) are `in_blocks` of `count` children. Equal to the bit to the last layer of
-    `perceptron` followed by `compose`. Raises `ValueError` for a row out of range.
+    `rest` is `unmoved` `in_blocks`. Equal to the bit to the last layer of `perceptron` followed by `compose`. Raises
+    `ValueError` for a row out of range.
     """
     geometry = rest.new_empty(len(rows), 3), rest.new_empty(len(rows), 4), rest.new_empty(len(rows), 3)
     by_unit = weights.t().contiguous()
+    bias = bias + (0 * weights).sum(1)  # a weight that is not finite counts for children without its unit too
     bounds = (extent, MAX_LOG_SCALE_OFFSET, *LOG_SCALE_RANGE)
-    kernel.kernel().move(hidden, rest, by_unit, bias, *bounds, count, rows, *geometry, kernel.thread_count())
+    kernel.kernel().move(*hidden, rest, by_unit, bias, *bounds, rows, *geometry, kernel.thread_count())
     return geometry

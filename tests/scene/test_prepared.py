@@ -16,7 +16,7 @@ from graings.render import draw, render
 from graings.scene.children import compose, gather, plain_compose
 from graings.scene.perceptron import perceptron, plain_perceptron
 from graings.scene.prepared import KEPT_TIMES, PreparedScene, possible_children
-from graings.scene.prepared_geometry import BLOCK, in_blocks, move, unmoved
+from graings.scene.prepared_geometry import BLOCK, ActiveUnits, in_blocks, move, unmoved
 from graings.scene.scene import Composed, Scene
 from tests.models import EYE, tiny_scene
 
@@ -196,14 +196,15 @@ def test_the_motion_kernel_against_its_oracle(anchors: int, slots: int, dtype: t
     random = torch.Generator().manual_seed(3)
     children = torch.arange(anchors * slots)
     width, extent = 21, 1.7
-    hidden = torch.rand(len(children), width, generator=random).to(dtype)
+    hidden = torch.randn(len(children), width, generator=random).relu().to(dtype)
+    hidden[: 2 * BLOCK, 3] = 0  # left out in two blocks
     weights, bias = torch.randn(10, width, generator=random).to(dtype), torch.randn(10, generator=random).to(dtype)
     with torch.no_grad():
         gathered = gather(scene.scaffold, children)
         canonical = scene.static(scene.scaffold.features, gathered)
         rows = children[torch.rand(len(children), generator=random) < 0.6]
-        arrays = (in_blocks(hidden), in_blocks(unmoved(canonical, gathered)))
-        found = move(*arrays, weights, bias, extent, len(children), rows)
+        arrays = (ActiveUnits.of(hidden), in_blocks(unmoved(canonical, gathered)))
+        found = move(*arrays, weights, bias, extent, rows)
         same = compose(canonical, gathered, perceptron(hidden, [weights], [bias]), extent, projected_clip=True)
         plain = plain_compose(canonical, gathered, plain_perceptron(hidden, [weights], [bias]), extent, projected_clip=True)
     roundoff = 2.0**-24 if dtype == torch.float32 else 2.0**-53
@@ -225,6 +226,6 @@ def test_blocks_hold_every_row_once() -> None:
 
 @pytest.mark.parametrize("rows", [[-1], [3 * BLOCK]])
 def test_rows_out_of_range_are_refused(rows: list[int]) -> None:
-    hidden, rest = torch.zeros(3, 5, BLOCK), torch.zeros(3, 10, BLOCK)
+    hidden, rest = ActiveUnits.of(torch.ones(3 * BLOCK, 5)), torch.zeros(3, 10, BLOCK)
     with pytest.raises(ValueError, match="rows"):
-        move(hidden, rest, torch.zeros(10, 5), torch.zeros(10), 1.0, 3 * BLOCK, torch.tensor(rows))
+        move(hidden, rest, torch.zeros(10, 5), torch.zeros(10), 1.0, torch.tensor(rows))

@@ -19,10 +19,10 @@ GRAINGS_INLINE void move_lanes(const MoveArgs<R>& args, int64_t block, int lane,
     using V = Vec<R, N>;
     V offset[kOffsets];
     for (int c = 0; c < kOffsets; c++) offset[c] = splat<R, N>(args.bias[c]);
-    const R *hidden = args.hidden + block * args.width * kMoving + lane, *weights = args.weights;
-    for (int64_t k = 0; k < args.width; k++) {
-        const V unit = load<N>(hidden + k * kMoving);
-        for (int c = 0; c < kOffsets; c++) offset[c] = fma(unit, splat<R, N>(weights[k * kOffsets + c]), offset[c]);
+    for (int64_t k = args.begin[block]; k < args.begin[block + 1]; k++) {
+        const V unit = load<N>(args.hidden + k * kMoving + lane);
+        const R* weights = args.weights + args.units[k] * kOffsets;
+        for (int c = 0; c < kOffsets; c++) offset[c] = fma(unit, splat<R, N>(weights[c]), offset[c]);
     }
     const R* rest = args.rest + block * kOffsets * kMoving + lane;
     V base[kOffsets], result[kOffsets];

@@ -2,8 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 #include <optional>
 #include <stdexcept>
+#include <vector>
 
 #include "buffer.hpp"
 #include "encoding.hpp"
@@ -68,6 +70,36 @@ void directions(int64_t rows, const R* position, const double* eye, double neare
 }
 
 template <class R>
+int64_t choose(const Shown<R>& in, const Rendered<R>& out, int threads) {
+    const R bound = R(in.bound), threshold = R(in.threshold);
+    const int64_t pieces = (in.count + kPiece - 1) / kPiece;
+    Buffer<R> scores{size_t(in.count)};
+    std::vector<int64_t> before(size_t(pieces) + 1, 0);
+    in_pieces(threads, in.count, kPiece, [&](int, int64_t begin, int64_t end) {
+        R *score = scores.get() + begin, changes[kPiece];
+        for (int64_t r = begin; in.change && r < end; r++) changes[r - begin] = in.change[in.slots[r] * in.stride];
+        if (in.change) kernels<R>().activate(kTanh, end - begin, changes, changes);
+        int64_t above = 0;
+        for (int64_t r = begin; r < end; r++, score++) {
+            *score = in.opacities[in.slots[r]];
+            if (in.change) *score += bound * changes[r - begin];
+            above += *score > threshold;
+        }
+        before[size_t(begin / kPiece) + 1] = above;
+    });
+    std::partial_sum(before.begin(), before.end(), before.begin());
+    in_pieces(threads, in.count, kPiece, [&](int, int64_t begin, int64_t end) {
+        int64_t at = before[size_t(begin / kPiece)];
+        for (int64_t r = begin; r < end; r++) {
+            if (!(scores[size_t(r)] > threshold)) continue;
+            out.rows[at] = r, out.slots[at] = in.slots[r], out.children[at] = in.children[r], out.uids[at] = in.uids[r];
+            out.opacities[at++] = scores[size_t(r)];
+        }
+    });
+    return before.back();
+}
+
+template <class R>
 void move(const MoveArgs<R>& args, int64_t children, int64_t drawn, int threads) {
     for (int64_t i = 0; i < drawn; i++)
         if (args.rows[i] < 0 || args.rows[i] >= children) throw std::invalid_argument("rows must be children of this scene");
@@ -108,6 +140,7 @@ void paint(const ColorNetworks<R>& in, const double* eye, double nearest, int64_
 #define GRAINGS_INSTANTIATE(R)                                                                   \
     template void activate<R>(Activation, int64_t, const R*, R*, int);                           \
     template void directions<R>(int64_t, const R*, const double*, double, R*, int);              \
+    template int64_t choose<R>(const Shown<R>&, const Rendered<R>&, int);                        \
     template void move<R>(const MoveArgs<R>&, int64_t, int64_t, int);                            \
     template void paint<R>(const ColorNetworks<R>&, const double*, double, int64_t, const int64_t*, R*, int);
 GRAINGS_INSTANTIATE(float)

@@ -16,6 +16,28 @@ void activate(Activation, int64_t count, const R* x, R* out, int threads);
 template <class R>
 void directions(int64_t rows, const R* position, const double* eye, double nearest, R* out, int threads);
 
+// The children that may be shown: row r is slot `slots[r]` of the kept anchors.
+template <class R>
+struct Shown {
+    int64_t count;
+    const int64_t *slots, *children, *uids;  // [count] each: of each row; slots ascend
+    const R* opacities;                      // [slots of all kept anchors]: canonical scores
+    const R* change;                         // of slot s at change[s * stride], before its bound; or null
+    int64_t stride;
+    double bound, threshold;                 // eta; scores up to `threshold` are not rendered
+};
+
+// The rendered rows in ascending order, at the front of arrays of `count`.
+template <class R>
+struct Rendered {
+    int64_t *rows, *slots, *children, *uids;
+    R* opacities;
+};
+
+// Selects the rows whose score, opacity + bound tanh(change), exceeds the threshold; returns their number.
+template <class R>
+int64_t choose(const Shown<R>&, const Rendered<R>&, int threads);
+
 // Geometry of `drawn` of `children` children, see MoveArgs. Throws std::invalid_argument for a row out of range.
 template <class R>
 void move(const MoveArgs<R>&, int64_t children, int64_t drawn, int threads);

@@ -1,6 +1,8 @@
 // Python bindings of prepared.hpp.
 #include "prepared.hpp"
 
+#include <algorithm>
+
 #include "arrays.hpp"
 
 namespace {
@@ -20,11 +22,31 @@ void bind(nb::module_& m) {
         nb::gil_scoped_release release;
         graings::directions<R>(int64_t(rows), position.data(), from, nearest, to, threads);
     });
-    m.def("move", [](In<R> hidden, In<R> rest, In<R> weights, In<R> bias, double extent, double change, double low, double high, int64_t children, In<int64_t> rows,
-                     Out<R> mean, Out<R> quat, Out<R> log_scale, int threads) {
-        const size_t blocks = size_t(children + graings::kMoving - 1) / graings::kMoving, width = weights.size() / graings::kOffsets, drawn = rows.size();
-        const graings::MoveArgs<R> args{int64_t(width),
-                                        checked(hidden, blocks * width * graings::kMoving, "hidden"),
+    m.def("choose", [](In<int64_t> slots, In<int64_t> children, In<int64_t> uids, In<R> opacities, std::optional<In<R>> change, int64_t stride, int64_t offset, double bound,
+                       double threshold, Out<int64_t> out_rows, Out<int64_t> out_slots, Out<int64_t> out_children, Out<int64_t> out_uids, Out<R> out_opacities, int threads) {
+        const size_t count = slots.size();
+        if (stride < 1 || offset < 0 || offset >= stride) throw std::invalid_argument("offset must lie in [0, stride)");
+        const int64_t* from = slots.data();
+        if (count && (*std::min_element(from, from + count) < 0 || *std::max_element(from, from + count) >= int64_t(opacities.size())))
+            throw std::invalid_argument("slots must have an opacity");
+        const R* changes = checked(change, opacities.size() * size_t(stride), "change");
+        const graings::Shown<R> in{int64_t(count), from, checked(children, count, "children"), checked(uids, count, "uids"), opacities.data(),
+                                   changes ? changes + offset : nullptr, stride, bound, threshold};
+        const graings::Rendered<R> out{checked(out_rows, count, "rows"), checked(out_slots, count, "slots"), checked(out_children, count, "children"),
+                                       checked(out_uids, count, "uids"), checked(out_opacities, count, "opacities")};
+        nb::gil_scoped_release release;
+        return graings::choose<R>(in, out, threads);
+    });
+    m.def("move", [](In<R> hidden, In<int64_t> begin, In<int32_t> units, In<R> rest, In<R> weights, In<R> bias, double extent, double change, double low, double high,
+                     In<int64_t> rows, Out<R> mean, Out<R> quat, Out<R> log_scale, int threads) {
+        const size_t blocks = begin.size() - 1, width = weights.size() / graings::kOffsets, drawn = rows.size();
+        const int64_t* starts = begin.data();
+        if (!begin.size() || starts[0] != 0 || !std::is_sorted(starts, starts + begin.size())) throw std::invalid_argument("begin must ascend from 0");
+        const int32_t* numbers = checked(units, size_t(starts[blocks]), "units");
+        if (units.size() && (*std::min_element(numbers, numbers + units.size()) < 0 || size_t(*std::max_element(numbers, numbers + units.size())) >= width))
+            throw std::invalid_argument("units must have weights");
+        const graings::MoveArgs<R> args{checked(hidden, units.size() * graings::kMoving, "hidden"),
+                                        starts, numbers,
                                         checked(rest, blocks * graings::kOffsets * graings::kMoving, "rest"),
                                         checked(weights, width * graings::kOffsets, "weights"),
                                         checked(bias, graings::kOffsets, "bias"),
@@ -32,7 +54,7 @@ void bind(nb::module_& m) {
                                         rows.data(),
                                         checked(mean, 3 * drawn, "mean"), checked(quat, 4 * drawn, "quat"), checked(log_scale, 3 * drawn, "log_scale")};
         nb::gil_scoped_release release;
-        graings::move<R>(args, children, int64_t(drawn), threads);
+        graings::move<R>(args, int64_t(blocks) * graings::kMoving, int64_t(drawn), threads);
     });
     m.def("paint", [](In<R> position, std::optional<In<R>> normals, int degree, In<R> hidden, std::vector<In<R>> weights, std::vector<In<R>> biases, int residual_degree,
                       std::optional<In<R>> residual_hidden, std::vector<In<R>> residual_weights, std::vector<In<R>> residual_biases, std::optional<In<R>> time_only,

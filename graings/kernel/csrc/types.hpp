@@ -187,16 +187,18 @@ constexpr int kMoving = 16;    // children per block of the arrays of MoveArgs
 constexpr int kOffsets = 10;   // outputs of DeformNet: position 3, rotation 4, log-scale 3
 enum Activation : int { kSigmoid, kTanh };
 
-// Children whose offsets in time are weights [width, kOffsets] times `hidden` plus `bias`. Blocks of kMoving children
-// hold one row of kMoving numbers for each hidden unit, and for each of mean 3, quaternion 4 and log-scale 3.
+// Children whose offsets in time are weights [width, kOffsets] times hidden units plus `bias`, in blocks of kMoving
+// children. A unit that is zero in a whole block is left out. Rows of `hidden` and `rest` hold a number for each child of
+// a block: those of block b are begin[b] to begin[b + 1], of the units `units`; in `rest` mean 3, quaternion 4, log-scale 3.
 template <class R>
 struct MoveArgs {
-    int64_t width;
-    const R *hidden, *rest;  // [blocks, width, kMoving], [blocks, kOffsets, kMoving]
-    const R *weights, *bias;
-    R extent, change, low, high;  // of the scene; bounds of log-scales
-    const int64_t* rows;          // children to move
-    R *mean, *quat, *log_scale;   // in the order of `rows`
+    const R* hidden;  // [units of all blocks, kMoving]
+    const int64_t* begin;
+    const int32_t* units;
+    const R *rest, *weights, *bias;  // rest: [blocks, kOffsets, kMoving]
+    R extent, change, low, high;     // of the scene; bounds of log-scales
+    const int64_t* rows;             // children to move
+    R *mean, *quat, *log_scale;      // in the order of `rows`
 };
 
 // The functions compiled once per instruction set.
