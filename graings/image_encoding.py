@@ -66,9 +66,10 @@ def encode_image(
         raise ValueError(f"quality must lie in [1, 100] and is for jpeg and webp only, got {quality} for {format}")
     if png_level is not None and (format != "png" or png_level not in PNG_LEVELS):
         raise ValueError(f"png_level must lie in [0, 9] and is for png only, got {png_level} for {format}")
-    pixels = image if format == "exr" else np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    levels = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     if format == "png":
-        return _png(pixels, png_level)
+        return _png(levels, png_level)
+    pixels = image if format == "exr" else levels
     height, width = image.shape[:2]
     spec = oiio.ImageSpec(width, height, 3, oiio.HALF if format == "exr" else oiio.UINT8)
     if format == "exr":
@@ -96,7 +97,7 @@ def _png(pixels: npt.NDArray[np.uint8], level: int | None) -> bytes:
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])
     strategy = zlib.Z_RLE if level is None else zlib.Z_DEFAULT_STRATEGY
     deflate = zlib.compressobj(1 if level is None else level, zlib.DEFLATED, zlib.MAX_WBITS, 9, strategy)
-    data = deflate.compress(filtered) + deflate.flush()
+    data = deflate.compress(filtered.tobytes()) + deflate.flush()
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, RGB, not interlaced
     return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
 

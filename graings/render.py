@@ -17,7 +17,7 @@ from torch import Tensor
 from graings.camera.camera import Camera
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
-from graings.scene.prepared import PreparedScene
+from graings.scene.prepared import PreparedScene as PreparedScene  # part of this module's interface too
 from graings.scene.scene import Composed, Scene
 
 # Upper bound of the supersampled image: four pixels for each of 1920 x 1080, in 200 MB.

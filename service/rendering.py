@@ -1,4 +1,4 @@
-"""Rendering: loaded models, and a pool of threads that renders images of them.
+"""Rendering: loaded models, prepared for it, and a pool of threads that renders images of them.
 
 Models are identified by path and modification time; the least recently used one is discarded. If too many requests wait
 for a thread, further ones are refused at once.
@@ -17,7 +17,7 @@ from anyio import CapacityLimiter, to_thread
 from graings.camera.camera import Camera
 from graings.errors import CheckpointError
 from graings.image_encoding import ImageFormat, encode_image
-from graings.render import render
+from graings.render import PreparedScene, render
 from graings.storage.compact import open_model
 from graings.storage.model import Model
 from graings.storage.run_folder import newest_model
@@ -36,15 +36,23 @@ class RenderRequest:
     format: ImageFormat
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedModel:
+    """A model in memory, prepared for rendering."""
+
+    model: Model
+    scene: PreparedScene
+
+
 class ModelCache:
     """At most `capacity` models in memory. `load` may be called from several threads."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
-        self._loaded: OrderedDict[_Key, Model] = OrderedDict()
+        self._loaded: OrderedDict[_Key, LoadedModel] = OrderedDict()
         self._guard = threading.Lock()
 
-    def load(self, run: Path) -> Model | None:
+    def load(self, run: Path) -> LoadedModel | None:
         """The model of a run folder, from its newest readable checkpoint, or None. Raises `CheckpointError`."""
         # One at a time, so that two requests for the same new checkpoint read it once.
         with self._guard:
@@ -52,8 +60,8 @@ class ModelCache:
             if newest is None:
                 return None
             key = _key(newest)
-            model = self._loaded.get(key) if key else None
-            if model is None:
+            loaded = self._loaded.get(key) if key else None
+            if loaded is None:
                 try:
                     model = open_model(run)
                 except CheckpointError:
@@ -62,14 +70,15 @@ class ModelCache:
                     model = open_model(run)  # training removed this checkpoint while it was read
                 if newest_model(run) != newest:
                     key = _key(model.path)
+                loaded = LoadedModel(model, PreparedScene(model.scene))
                 if key:
                     self._discard(newest.parent)
-                    self._loaded[key] = model
+                    self._loaded[key] = loaded
             if key:
                 self._loaded.move_to_end(key)
             while len(self._loaded) > self._capacity:
                 self._loaded.popitem(last=False)
-            return model
+            return loaded
 
     def _discard(self, folder: Path) -> None:
         """Discard the older models of the same run."""
@@ -85,19 +94,19 @@ class RenderPool:
         self._max_requests = slots + waiting
         self._requests = 0
 
-    async def render(self, model: Model, request: RenderRequest) -> bytes:
+    async def render(self, loaded: LoadedModel, request: RenderRequest) -> bytes:
         """The encoded image. Raises `Busy`."""
         if self._requests >= self._max_requests:
             raise Busy("Too many images are being rendered. Try again in a moment.")
         self._requests += 1
         try:
-            return await to_thread.run_sync(_rendered, model, request, limiter=self._limiter)
+            return await to_thread.run_sync(_rendered, loaded, request, limiter=self._limiter)
         finally:
             self._requests -= 1
 
 
-def _rendered(model: Model, request: RenderRequest) -> bytes:
-    result = render(model.scene, request.camera, request.time, request.background)
+def _rendered(loaded: LoadedModel, request: RenderRequest) -> bytes:
+    result = render(loaded.scene, request.camera, request.time, request.background)
     return encode_image(np.asarray(result.color, dtype=np.float32), request.format)
 
 

@@ -2,7 +2,8 @@
 
 In float32 tanh is exactly 1 from 9.02 on and the sigmoid from about 17. A derivative computed from such a value is
 exactly 0, and no loss could ever change it again. Computed from the argument it stays positive, and Adam, whose steps
-do not depend on the size of gradients, leaves the saturation. Values are computed in float64 by the compiled kernel and rounded, and have the same bits wherever a number stands in its tensor.
+do not depend on the size of gradients, leaves the saturation. The compiled kernel computes values in float64 and rounds
+them: they have the same bits wherever a number stands in its tensor.
 """
 
 from __future__ import annotations

@@ -100,6 +100,19 @@ class CanonicalAppearance(nn.Module):
         bound: Tensor = highest @ weights[1].clamp_min(0).T + lowest @ weights[1].clamp_max(0).T + biases[1]
         return bound
 
+    def opacity_rounding(self, features: Float[Tensor, "anchor feature"]) -> Float[Tensor, "anchor child"]:
+        """Upper bound of the rounding errors of `opacity_logits` and `highest_opacity_logits` together.
+
+        A sum of n products is off by at most n u / (1 - n u) times the sum of their magnitudes, u half of `eps`; ReLU
+        passes an error on unchanged, so those of two layers add up to n_1 + n_2 times the magnitudes through both.
+        """
+        weights, biases = [[tensor.abs() for tensor in tensors] for tensors in weights_and_biases(self.opacity)]
+        width = features.shape[-1]
+        first = features.abs() @ weights[0][:, :width].T + weights[0][:, width:].norm(dim=-1) + biases[0]
+        terms = sum(weight.shape[1] + 4 for weight in weights)  # biases and the length of the direction besides
+        magnitudes: Tensor = first @ weights[1].T + biases[1]
+        return 2 * terms * torch.finfo(features.dtype).eps * magnitudes
+
 
 class TemporalHead(nn.Module):
     """A network with one hidden layer and the encoded time as a further input; its output is zero at initialization.
@@ -121,10 +134,14 @@ class TemporalHead(nn.Module):
         weight = self.from_feature.weight[:, : features.shape[-1]]
         return _per_row(perceptron(features, [weight], [self.from_feature.bias]))
 
-    def layers(self, others: int, encoded_time: Float[Tensor, " time"]) -> tuple[list[Tensor], list[Tensor]]:
-        """Weights and biases that remain at a time once the part of the features is known; `others`: further inputs."""
+    def other_weights(self, others: int) -> list[Tensor]:
+        """Weights that remain once the part of the features is known; the last `others` inputs are not features."""
         first = self.from_feature.weight
-        return [first[:, first.shape[1] - others :], self.out.weight], [self.from_time(encoded_time), self.out.bias]
+        return [first[:, first.shape[1] - others :], self.out.weight]
+
+    def biases(self, encoded_time: Float[Tensor, " time"]) -> list[Tensor]:
+        """The biases that go with `other_weights` at a time."""
+        return [self.from_time(encoded_time), self.out.bias]
 
     def predict(
         self,
@@ -134,7 +151,7 @@ class TemporalHead(nn.Module):
     ) -> Float[Tensor, "row output"]:
         """The output for each row of `feature_part`, with further inputs, at the time encoded by `encoded_time`."""
         inputs = part.values.new_empty(len(part.values), 0) if others is None else others
-        return perceptron(inputs, *self.layers(inputs.shape[1], encoded_time), shared=part)
+        return perceptron(inputs, self.other_weights(inputs.shape[1]), self.biases(encoded_time), shared=part)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

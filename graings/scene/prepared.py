@@ -11,7 +11,7 @@ have the same order (tests/scene/test_prepared.py).
 
 Children that no time and no view can show are left out. A score is o = o_can + Delta o with |Delta o| <= eta, and
 rounding is monotone: where o_can + eta, rounded, is at most 1/255, so is every o. With `opacity_view` the bound of
-o_can over all directions takes its place, enlarged by a margin for its rounding.
+o_can over all directions takes its place, enlarged by a bound of the rounding of both.
 """
 
 from __future__ import annotations
@@ -19,75 +19,66 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from graings import constants, kernel
+from graings import constants
 from graings.gaussians import Gaussians
 from graings.scene.activations import tanh
 from graings.scene.children import Geometry
-from graings.scene.prepared_colors import Changes, PreparedColors
+from graings.scene.prepared_appearance import Candidates, Changes, PreparedAppearance, Rendered
 from graings.scene.prepared_geometry import prepared_geometry
 from graings.scene.scene import Composed, Scene
 
 # Times of which geometry and opacities are kept: players show one time from many views, or a few times again.
 KEPT_TIMES: Final = 4
 
-# Covers the rounding of `highest_opacity_logits`, whose sums have another order than the scores they bound.
-_OPACITY_MARGIN: Final = 1e-4
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Instant:
     """What all views of one time share."""
 
-    rendered: _Rendered
+    rendered: Rendered
     geometry: Geometry
     changes: Changes | None
-
-
-class _Rendered(NamedTuple):
-    """The children that some view shows at one time, in the order of the scene."""
-
-    rows: Int64[Tensor, " gaussian"]  # among those that any time shows
-    slots: Int64[Tensor, " gaussian"]  # among those of the kept anchors
-    children: Int64[Tensor, " gaussian"]  # flat slots (anchor * k + child) of the scene
-    uids: Int64[Tensor, " gaussian"]
-    opacities: Float[Tensor, " gaussian"]
 
 
 class PreparedScene:
     """`scene` as it is now, for many views of it; valid until a parameter of `scene` changes.
 
-    May be used from several threads.
+    May be used from several threads. `kept_times` is how many of the last times are kept; 0: none.
     """
 
     @torch.inference_mode()
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, *, kept_times: int = KEPT_TIMES) -> None:
         self.scene = scene
         scaffold, slots = scene.scaffold, scene.scaffold.slots
-        self._residual = scene.residual if scene.temporal else None
         shown = possible_children(scene)
         self._anchors = shown.any(1).nonzero().squeeze(-1)
         self._features = scaffold.features.index_select(0, self._anchors)
         self._opacity_offsets = scaffold.opacity_offsets.index_select(0, self._anchors).unsqueeze(-1)
-        self._opacities = None if scene.config.opacity_view else self._canonical_opacities(None)
-        self._kept = shown.index_select(0, self._anchors).flatten().nonzero().squeeze(-1)
-        self._slots = self._anchors[self._kept // slots] * slots + self._kept % slots
-        self._uids = scaffold.child_uids(self._slots)
-        self._geometry = prepared_geometry(scene, self._slots)
-        self._colors = PreparedColors(scene, self._anchors, self._features)
+        self._opacities = (
+            None
+            if scene.config.opacity_view
+            else self._canonical_opacities(self._features.new_empty(len(self._features), 3))
+        )
+        kept = shown.index_select(0, self._anchors).flatten().nonzero().squeeze(-1)
+        children = self._anchors[kept // slots] * slots + kept % slots
+        self._candidates = Candidates(kept, children, scaffold.child_uids(children))
+        self._geometry = prepared_geometry(scene, children)
+        self._appearance = PreparedAppearance(scene, self._anchors, self._features)
+        self._kept_times = kept_times
         self._instants: OrderedDict[float, _Instant] = OrderedDict()
         self._guard = threading.Lock()
 
     @property
     def children(self) -> int:
         """Number of children that some time and view may show."""
-        return len(self._slots)
+        return len(self._candidates.children)
 
     @torch.inference_mode()
     def compose(self, eye: ArrayLike, time: float) -> Composed:
@@ -100,7 +91,7 @@ class PreparedScene:
                 quats=quats,
                 log_scales=log_scales,
                 opacities=rendered.opacities,
-                colors=self._colors.of(eye, rendered.slots, instant.changes),
+                colors=self._appearance.colors(eye, rendered.slots, instant.changes),
                 uids=rendered.uids,
             ),
             children=rendered.children,
@@ -120,33 +111,17 @@ class PreparedScene:
         instant = self._instant_with(self._opacities, time)
         with self._guard:
             self._instants[time] = instant
-            while len(self._instants) > KEPT_TIMES:
+            while len(self._instants) > self._kept_times:
                 self._instants.popitem(last=False)
         return instant
 
     def _instant_with(self, opacities: Float[Tensor, "anchor child"], time: float) -> _Instant:
         """The instant with these canonical `opacities`."""
-        changes = self._colors.changes(time)
-        rendered = self._rendered(opacities, changes)
+        rendered, changes = self._appearance.rendered(self._candidates, opacities, time)
         return _Instant(rendered, self._geometry.at(time, rendered.rows), changes)
 
-    def _rendered(self, opacities: Float[Tensor, "anchor child"], changes: Changes | None) -> _Rendered:
-        """The children whose score, canonical and residual, exceeds the rendering threshold."""
-        count = self.children
-        found = _Rendered(*(torch.empty_like(self._kept) for _ in range(4)), opacities.new_empty(count))
-        change: tuple[Any, ...] = (None, 1, 0, 0.0)
-        if changes is not None and self._residual is not None:
-            width = changes.values.shape[-1]
-            change = (changes.values, width, width - 1, self._residual.scale)
-        slots = (self._kept, self._slots, self._uids)
-        number = kernel.kernel().choose(
-            *slots, opacities, *change, constants.ALPHA_MIN, *found, kernel.thread_count()
-        )
-        return _Rendered(*(part[:number] for part in found))
-
-    def _canonical_opacities(self, directions: Float[Tensor, "anchor 3"] | None) -> Float[Tensor, "anchor child"]:
-        """o_can (Eq. 11) of every slot of the kept anchors."""
-        directions = self._features.new_empty(len(self._features), 3) if directions is None else directions
+    def _canonical_opacities(self, directions: Float[Tensor, "anchor 3"]) -> Float[Tensor, "anchor child"]:
+        """o_can (Eq. 11) of every slot of the kept anchors; `directions` count with `opacity_view` only."""
         return tanh(self.scene.appearance.opacity_logits(self._features, directions) + self._opacity_offsets)
 
 
@@ -154,11 +129,10 @@ def possible_children(scene: Scene) -> Bool[Tensor, "anchor child"]:
     """Which child slots some time and some view may show; see the module for the proof."""
     scaffold, residual = scene.scaffold, scene.residual if scene.temporal else None
     with torch.no_grad():
-        logits = scene.appearance.highest_opacity_logits(scaffold.features)
-        if not scene.config.opacity_view:
-            logits = scene.appearance.opacity_logits(scaffold.features, scaffold.anchors)
+        if scene.config.opacity_view:
+            logits = scene.appearance.highest_opacity_logits(scaffold.features)
+            logits = logits + scene.appearance.opacity_rounding(scaffold.features)
+        else:
+            logits = scene.appearance.opacity_logits(scaffold.features, scaffold.anchors)  # which has no direction
         highest = tanh(logits + scaffold.opacity_offsets.unsqueeze(-1))
-        if residual is not None:
-            highest = highest + residual.scale
-        margin = _OPACITY_MARGIN if scene.config.opacity_view else 0.0
-        return highest + margin > constants.ALPHA_MIN
+        return highest + (0.0 if residual is None else residual.scale) > constants.ALPHA_MIN

@@ -103,7 +103,7 @@ def in_blocks(rows: Float[Tensor, "child width"]) -> Float[Tensor, "block width 
 class ActiveUnits(NamedTuple):
     """Hidden units in blocks of `BLOCK` children, without those that ReLU makes zero in a whole block.
 
-    A third of them, because children near each other share theirs. They add exactly nothing to a sum.
+    A third is left out, because children near each other share theirs; it adds exactly nothing to a sum.
     """
 
     values: Float[Tensor, "active 16"]
@@ -133,8 +133,6 @@ def move(
     `ValueError` for a row out of range.
     """
     geometry = rest.new_empty(len(rows), 3), rest.new_empty(len(rows), 4), rest.new_empty(len(rows), 3)
-    by_unit = weights.t().contiguous()
-    bias = bias + (0 * weights).sum(1)  # a weight that is not finite counts for children without its unit too
     bounds = (extent, MAX_LOG_SCALE_OFFSET, *LOG_SCALE_RANGE)
-    kernel.kernel().move(*hidden, rest, by_unit, bias, *bounds, rows, *geometry, kernel.thread_count())
+    kernel.kernel().move(*hidden, rest, weights.contiguous(), bias, *bounds, rows, *geometry, kernel.thread_count())
     return geometry

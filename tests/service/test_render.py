@@ -15,11 +15,11 @@ from graings.camera.camera import Camera
 from graings.camera.view_request import MAX_SIDE
 from graings.camera.viewpoint import orbit_view
 from graings.image_encoding import encode_image
-from graings.render import render
+from graings.render import PreparedScene, render
 from graings.storage.checkpoint import load_model
 from jobs.store import JobFolder
 from service.problems import Busy
-from service.rendering import ModelCache, RenderPool, RenderRequest
+from service.rendering import LoadedModel, ModelCache, RenderPool, RenderRequest
 from service.settings import Settings
 from tests.service.conftest import ITERATIONS, SIZE
 from tests.service.test_jobs import problem
@@ -235,7 +235,8 @@ def test_a_model_is_loaded_once_until_its_checkpoint_changes(trained: Path, tmp_
 
 def test_a_request_beyond_the_limit_is_refused_at_once(trained: Path) -> None:
     pool = RenderPool(slots=1, waiting=1)
-    model = load_model(trained)
+    loaded = load_model(trained)
+    model = LoadedModel(loaded, PreparedScene(loaded.scene))
     camera = Camera.orbit(0.0, 0.0, 3.0, fov=0.7, width=8, height=8)
     request = RenderRequest(camera, 0.0, (1.0, 1.0, 1.0), "png")
     answers: list[str] = []

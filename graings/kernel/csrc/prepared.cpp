@@ -25,28 +25,34 @@ void in_pieces(int threads, int64_t count, int64_t size, Body body) {
     parallel_for(threads, (count + size - 1) / size, [&](int worker, int64_t piece) { body(worker, piece * size, std::min(count, (piece + 1) * size)); });
 }
 
-// A network of encoded directions and its buffers for one piece of anchors, per worker.
+// A network with the inputs of a piece of anchors, each a group of its own, and buffers for each worker.
 template <class R>
 struct Head {
     Packed<R> packed;
-    int degree, harmonics;
-    const R* normals;
-    int64_t outputs;
+    int64_t inputs, outputs;
     Buffer<R> encoded, raw, scratch;
+    int64_t numbers[kPieceAnchors];
 
-    Head(const Network<R>& network, int degree, const R* normals, int threads)
-        : packed(network, nullptr, nullptr, false), degree(degree), harmonics(int(network.widths[0])), normals(normals), outputs(network.widths.back()),
-          encoded(size_t(threads * kPieceAnchors * harmonics)), raw(size_t(threads * kPieceAnchors * outputs)), scratch(size_t(threads * packed.scratch)) {}
+    Head(const Network<R>& network, int threads)
+        : packed(network, nullptr, nullptr, false), inputs(network.widths[0]), outputs(network.widths.back()), encoded(size_t(threads * kPieceAnchors * inputs)),
+          raw(size_t(threads * kPieceAnchors * outputs)), scratch(size_t(threads * packed.scratch)) {
+        for (int64_t i = 0; i < kPieceAnchors; i++) numbers[i] = i;
+    }
 
-    // The outputs [anchors of the piece, outputs].
-    const R* values(int worker, int64_t first, int64_t last, const R* directions, const int64_t* numbers) {
+    // Outputs [last - first, outputs] from `input`.
+    void evaluate(int worker, int64_t first, int64_t last, const R* input, R* output) {
         NetworkArgs<R> args = packed.args;
-        R* inputs = encoded.get() + worker * kPieceAnchors * harmonics;
-        encode_directions(last - first, degree, directions, normals ? normals + 3 * first : nullptr, inputs, 1);
-        args.input = inputs, args.output = raw.get() + worker * kPieceAnchors * outputs;
+        args.input = input, args.output = output;
         args.shared += first * args.widths[1], args.groups = numbers;
         kernels<R>().network_values(args, 0, last - first, scratch.get() + worker * packed.scratch);
-        return args.output;
+    }
+
+    // The same from encoded directions, in a buffer of the worker.
+    const R* seen(int worker, int64_t first, int64_t last, int degree, const R* directions, const R* normals) {
+        R *input = encoded.get() + worker * kPieceAnchors * inputs, *output = raw.get() + worker * kPieceAnchors * outputs;
+        encode_directions(last - first, degree, directions, normals ? normals + 3 * first : nullptr, input, 1);
+        evaluate(worker, first, last, input, output);
+        return output;
     }
 };
 
@@ -70,22 +76,30 @@ void directions(int64_t rows, const R* position, const double* eye, double neare
 }
 
 template <class R>
-int64_t choose(const Shown<R>& in, const Rendered<R>& out, int threads) {
+int64_t choose(const Shown<R>& in, int64_t slots, const Rendered<R>& out, int threads) {
     const R bound = R(in.bound), threshold = R(in.threshold);
+    int64_t stride = 0;
+    if (in.change) {
+        Head<R> head(in.residual, threads);
+        stride = head.outputs * in.anchors / std::max<int64_t>(slots, 1);
+        in_pieces(threads, in.anchors, kPieceAnchors, [&](int worker, int64_t first, int64_t last) { head.evaluate(worker, first, last, nullptr, in.change + first * head.outputs); });
+    }
     const int64_t pieces = (in.count + kPiece - 1) / kPiece;
     Buffer<R> scores{size_t(in.count)};
     std::vector<int64_t> before(size_t(pieces) + 1, 0);
     in_pieces(threads, in.count, kPiece, [&](int, int64_t begin, int64_t end) {
         R *score = scores.get() + begin, changes[kPiece];
-        for (int64_t r = begin; in.change && r < end; r++) changes[r - begin] = in.change[in.slots[r] * in.stride];
-        if (in.change) kernels<R>().activate(kTanh, end - begin, changes, changes);
-        int64_t above = 0;
-        for (int64_t r = begin; r < end; r++, score++) {
-            *score = in.opacities[in.slots[r]];
-            if (in.change) *score += bound * changes[r - begin];
-            above += *score > threshold;
+        for (int64_t r = begin; r < end; r++) {
+            const int64_t slot = in.slots[r];
+            if (slot < 0 || slot >= slots) throw std::invalid_argument("slots must have an opacity");
+            score[r - begin] = in.opacities[slot];
+            if (in.change) changes[r - begin] = in.change[slot * stride + stride - 1];
         }
-        before[size_t(begin / kPiece) + 1] = above;
+        if (in.change) {
+            kernels<R>().activate(kTanh, end - begin, changes, changes);
+            for (int64_t i = 0; i < end - begin; i++) score[i] += bound * changes[i];
+        }
+        before[size_t(begin / kPiece) + 1] = std::count_if(score, score + (end - begin), [&](R x) { return x > threshold; });
     });
     std::partial_sum(before.begin(), before.end(), before.begin());
     in_pieces(threads, in.count, kPiece, [&](int, int64_t begin, int64_t end) {
@@ -101,9 +115,11 @@ int64_t choose(const Shown<R>& in, const Rendered<R>& out, int threads) {
 
 template <class R>
 void move(const MoveArgs<R>& args, int64_t children, int64_t drawn, int threads) {
-    for (int64_t i = 0; i < drawn; i++)
-        if (args.rows[i] < 0 || args.rows[i] >= children) throw std::invalid_argument("rows must be children of this scene");
-    in_pieces(threads, drawn, kPieceChildren, [&](int, int64_t begin, int64_t end) { kernels<R>().move_children(args, begin, end); });
+    in_pieces(threads, drawn, kPieceChildren, [&](int, int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; i++)
+            if (args.rows[i] < 0 || args.rows[i] >= children) throw std::invalid_argument("rows must be children of this scene");
+        kernels<R>().move_children(args, begin, end);
+    });
 }
 
 template <class R>
@@ -112,20 +128,18 @@ void paint(const ColorNetworks<R>& in, const double* eye, double nearest, int64_
     for (int64_t i = 0; i < drawn; i++)
         if (children[i] < (i ? children[i - 1] + 1 : 0) || children[i] >= in.anchors * slots)
             throw std::invalid_argument("children must be slots of these anchors in ascending order");
-    Head<R> canonical(in.canonical, in.degree, in.normals, threads);
+    Head<R> canonical(in.canonical, threads);
     std::optional<Head<R>> residual;
-    if (in.residual_degree) residual.emplace(in.residual, in.residual_degree, nullptr, threads);
+    if (in.residual_degree) residual.emplace(in.residual, threads);
     Buffer<R> towards(size_t(threads * kPieceAnchors * 3)), changes(size_t(threads * kPieceAnchors * row));
-    int64_t numbers[kPieceAnchors];
-    for (int64_t i = 0; i < kPieceAnchors; i++) numbers[i] = i;
     in_pieces(threads, in.anchors, kPieceAnchors, [&](int worker, int64_t first, int64_t last) {
         const int64_t* from = std::lower_bound(children, children + drawn, first * slots);
         const int64_t* to = std::lower_bound(from, children + drawn, last * slots);
         if (from == to) return;
         R *direction = towards.get() + worker * kPieceAnchors * 3, *change = changes.get() + worker * kPieceAnchors * row;
         directions(last - first, in.position + 3 * first, eye, nearest, direction, 1);
-        const R* raw = canonical.values(worker, first, last, direction, numbers);
-        const R* seen = residual ? residual->values(worker, first, last, direction, numbers) : nullptr;
+        const R* raw = canonical.seen(worker, first, last, in.degree, direction, in.normals);
+        const R* seen = residual ? residual->seen(worker, first, last, in.residual_degree, direction, nullptr) : nullptr;
         R* out = colors + 3 * (from - children);
         for (const int64_t* child = from; child < to; child++) {
             const int64_t at = *child - first * slots, i = 3 * (child - from);
@@ -140,7 +154,7 @@ void paint(const ColorNetworks<R>& in, const double* eye, double nearest, int64_
 #define GRAINGS_INSTANTIATE(R)                                                                   \
     template void activate<R>(Activation, int64_t, const R*, R*, int);                           \
     template void directions<R>(int64_t, const R*, const double*, double, R*, int);              \
-    template int64_t choose<R>(const Shown<R>&, const Rendered<R>&, int);                        \
+    template int64_t choose<R>(const Shown<R>&, int64_t, const Rendered<R>&, int);                        \
     template void move<R>(const MoveArgs<R>&, int64_t, int64_t, int);                            \
     template void paint<R>(const ColorNetworks<R>&, const double*, double, int64_t, const int64_t*, R*, int);
 GRAINGS_INSTANTIATE(float)

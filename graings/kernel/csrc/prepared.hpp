@@ -19,11 +19,11 @@ void directions(int64_t rows, const R* position, const double* eye, double neare
 // The children that may be shown: row r is slot `slots[r]` of the kept anchors.
 template <class R>
 struct Shown {
-    int64_t count;
+    int64_t count, anchors;
     const int64_t *slots, *children, *uids;  // [count] each: of each row; slots ascend
     const R* opacities;                      // [slots of all kept anchors]: canonical scores
-    const R* change;                         // of slot s at change[s * stride], before its bound; or null
-    int64_t stride;
+    Network<R> residual;                     // no inputs but `shared` -> values of each slot, the last for its score; or empty
+    R* change;                               // [anchors, outputs of `residual`]: written; null if there is none
     double bound, threshold;                 // eta; scores up to `threshold` are not rendered
 };
 
@@ -35,8 +35,9 @@ struct Rendered {
 };
 
 // Selects the rows whose score, opacity + bound tanh(change), exceeds the threshold; returns their number.
+// Throws std::invalid_argument for a slot without an opacity.
 template <class R>
-int64_t choose(const Shown<R>&, const Rendered<R>&, int threads);
+int64_t choose(const Shown<R>&, int64_t slots, const Rendered<R>&, int threads);
 
 // Geometry of `drawn` of `children` children, see MoveArgs. Throws std::invalid_argument for a row out of range.
 template <class R>
