@@ -5,9 +5,10 @@
 For each model, image size and number of threads, medians in milliseconds of `render` at a time and from a view not seen
 before, of `rasterize` for the Gaussians of that view, of `render` from another view at that time (`orbit_ms`), and of
 the PNG encoding that the service uses. They are timed in turn in one process, so their ratios mean something on a busy
-machine; `ratio_quiet` is that of the lowest tenths, which other processes disturb least. `before_ms` (--before) is the
-path that training uses: `Scene.compose`, then `rasterize`. `first_ms` is the first view after a model was read:
-preparation and `render`.
+machine. Other processes disturb a longer call more often: `ratio_cpu` is the ratio of the CPU times, with one thread,
+which do not count what other processes take. `before_ms` (--before) is the path that training uses, `Scene.compose` and
+then `rasterize`; its image must have the same bits. `first_ms` is the first view after a model was read: preparation
+and `render`.
 
 A line a PNG level follows: size and milliseconds of one image.
 
@@ -34,7 +35,7 @@ import numpy as np
 import torch
 
 from graings import kernel
-from graings.camera.camera import View
+from graings.camera.camera import Camera
 from graings.image_encoding import encode_image
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
@@ -46,79 +47,94 @@ from graings.storage.model import Model
 WARM_UPS = 3
 
 
-def milliseconds(call: Callable[[], Any], times: list[float] | None = None) -> Any:
-    """The result of `call`, whose milliseconds are appended to `times`."""
-    started = time.perf_counter()
-    result = call()
-    if times is not None:
-        times.append(1e3 * (time.perf_counter() - started))
-    return result
+class Times:
+    """Milliseconds of calls, by the clock and on the CPU."""
 
+    def __init__(self) -> None:
+        self.wall: list[float] = []
+        self.cpu: list[float] = []
 
-def lowest_tenth(times: list[float]) -> float:
-    return sorted(times)[len(times) // 10]
+    def of(self, call: Callable[[], Any], counted: bool = True) -> Any:
+        """The result of `call`."""
+        started, started_cpu = time.perf_counter(), time.process_time()
+        result = call()
+        if counted:
+            self.wall.append(1e3 * (time.perf_counter() - started))
+            self.cpu.append(1e3 * (time.process_time() - started_cpu))
+        return result
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.wall)
 
 
 def measured(model: Model, name: str, px: int, threads: int, rounds: int, before: bool) -> dict[str, Any]:
     """One row."""
-    first: list[float] = []
     views = [view for split in model.views.values() for view in split]
     background = torch.tensor(model.background)
-
-    def at(index: int) -> View:
-        view = views[(7 * index) % len(views)]
-        longer = max(view.camera.width, view.camera.height)
-        size = [max(1, round(side * px / longer)) for side in (view.camera.width, view.camera.height)]
-        return View(view.name, view.camera.resized(*size), 0.0)
-
-    def first_view() -> PreparedScene:
-        prepared = PreparedScene(model.scene)
-        render(prepared, at(0).camera, 0.123, model.background)
-        return prepared
-
-    prepared = milliseconds(first_view, first)
-    spent: dict[str, list[float]] = {key: [] for key in ("render", "rasterize", "orbit", "encode", "before")}
+    first, drawn, raster, orbit, encoded, unprepared = (Times() for _ in range(6))
     gaussians = 0
-    for number in range(-WARM_UPS, rounds):
-        index = number + WARM_UPS
+
+    def camera_of(index: int) -> Camera:
+        camera = views[(7 * index) % len(views)].camera
+        longer = max(camera.width, camera.height)
+        return camera.resized(*(max(1, round(side * px / longer)) for side in (camera.width, camera.height)))
+
+    def one_round(index: int, counted: bool) -> None:
+        nonlocal gaussians
         moment = (index * 0.6180339887498949) % 1.0  # spread over the clip, never the same twice
-        camera, other = at(index).camera, at(index + 1).camera
-        into = {key: times if number >= 0 else None for key, times in spent.items()}
-        image = milliseconds(lambda: render(prepared, camera, moment, model.background), into["render"])  # noqa: B023
+        camera, other = camera_of(index), camera_of(index + 1)
+        image = drawn.of(lambda: render(prepared, camera, moment, model.background), counted)
         with torch.inference_mode():
             composed = prepared.compose(camera.center, moment)
             settings = RasterSettings(blur=low_pass(composed, camera))
-            arguments = (composed.gaussians, camera, background)
-            milliseconds(lambda: rasterize(*arguments, settings=settings, depth=False), into["rasterize"])  # noqa: B023
-        milliseconds(lambda: render(prepared, other, moment, model.background), into["orbit"])  # noqa: B023
-        milliseconds(lambda: encode_image(np.asarray(image.color), "png"), into["encode"])  # noqa: B023
+            raster.of(
+                lambda: rasterize(composed.gaussians, camera, background, settings=settings, depth=False), counted
+            )
+        orbit.of(lambda: render(prepared, other, moment, model.background), counted)
+        encoded.of(lambda: encode_image(np.asarray(image.color), "png"), counted)
         gaussians = max(gaussians, len(composed.gaussians))
-        if before:
 
-            def unprepared() -> Any:
-                with torch.inference_mode():
-                    composition = model.scene.compose(camera.center, moment)  # noqa: B023
-                    return render_composition(composition, camera, model.background)  # noqa: B023
+    def one_before(index: int, counted: bool) -> None:
+        moment = (index * 0.6180339887498949) % 1.0
+        camera = camera_of(index)
+        with torch.inference_mode():
+            expected = unprepared.of(
+                lambda: render_composition(model.scene.compose(camera.center, moment), camera, model.background),
+                counted,
+            )
+        found = render(prepared, camera, moment, model.background)
+        assert torch.equal(expected.color, found.color), "the prepared scene draws another image"
 
-            expected = milliseconds(unprepared, into["before"])
-            assert torch.equal(expected.color, image.color), "the prepared scene draws another image"
-    middle = {key: statistics.median(times) for key, times in spent.items() if times}
-    row = {
+    def first_view() -> PreparedScene:
+        scene = PreparedScene(model.scene)
+        render(scene, camera_of(0), 0.123, model.background)
+        return scene
+
+    prepared = first.of(first_view)
+    for number in range(-WARM_UPS, rounds):
+        one_round(number + WARM_UPS, number >= 0)
+    for number in range(-1, rounds // 2 if before else -1):
+        one_before(number + 1, number >= 0)
+    row: dict[str, Any] = {
         "model": name,
         "gaussians": gaussians,
         "px": px,
         "threads": threads,
-        "render_ms": middle["render"],
-        "rasterize_ms": middle["rasterize"],
-        "ratio": middle["render"] / middle["rasterize"],
-        "ratio_quiet": lowest_tenth(spent["render"]) / lowest_tenth(spent["rasterize"]),
-        "orbit_ms": middle["orbit"],
-        "encode_ms": middle["encode"],
-        "fps": 1e3 / middle["render"],
-        "first_ms": first[0],
+        "render_ms": drawn.median,
+        "rasterize_ms": raster.median,
+        "ratio": drawn.median / raster.median,
+        "encode_ms": encoded.median,
+        "fps": 1e3 / drawn.median,
+        "orbit_ms": orbit.median,
+        "first_ms": first.median,
     }
+    if threads == 1:
+        row["ratio_cpu"] = statistics.median(drawn.cpu) / statistics.median(raster.cpu)
     if before:
-        row |= {"before_ms": middle["before"], "before_ratio": middle["before"] / middle["rasterize"]}
+        row |= {"before_ms": unprepared.median, "before_ratio": unprepared.median / raster.median}
+        if threads == 1:
+            row["before_ratio_cpu"] = statistics.median(unprepared.cpu) / statistics.median(raster.cpu)
     return {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()}
 
 
@@ -129,12 +145,11 @@ def png_levels(model: Model, name: str, px: int, rounds: int) -> list[dict[str, 
     color = render(scene, view.camera.resized(px, px), 0.5, model.background).color.numpy()
     rows = []
     for level in (None, 0, 1, 3, 6, 9):
-        times: list[float] = []
+        times = Times()
         for _ in range(rounds):
-            data = milliseconds(lambda: encode_image(color, "png", png_level=level), times)  # noqa: B023
-        rows.append(
-            {"model": name, "px": px, "png_level": level, "bytes": len(data), "ms": round(statistics.median(times), 3)}
-        )
+            data = times.of(lambda: encode_image(color, "png", png_level=level))  # noqa: B023
+        cpu = round(statistics.median(times.cpu), 3)
+        rows.append({"model": name, "px": px, "png_level": level, "bytes": len(data), "cpu_ms": cpu})
     return rows
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int64
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -83,8 +82,9 @@ class PreparedAppearance:
 
         Scores are those of `Scene.compose` to the bit.
         """
-        rows, slots, children, uids = (torch.empty_like(candidates.slots) for _ in range(4))
-        found = Rendered(rows, slots, children, uids, opacities.new_empty(len(rows)))
+        count = len(candidates.slots)
+        rows, slots, children, uids = candidates.slots.new_empty(4, count).unbind(0)
+        found = Rendered(rows, slots, children, uids, opacities.new_empty(count))
         head: tuple[Any, ...] = (None, [], [], None, 0.0)
         changes = None
         if self._residual is not None and self._time_only is not None:

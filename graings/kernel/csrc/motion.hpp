@@ -20,6 +20,8 @@ GRAINGS_INLINE void move_lanes(const MoveArgs<R>& args, int64_t block, int lane,
     V offset[kOffsets];
     for (int c = 0; c < kOffsets; c++) offset[c] = splat<R, N>(args.bias[c]);
     for (int64_t k = args.begin[block]; k < args.begin[block + 1]; k++) {
+        constexpr int kAhead = 24;  // units: a block crosses pages, where the CPU stops reading ahead
+        __builtin_prefetch(args.hidden + (k + kAhead) * kMoving + lane);
         const V unit = load<N>(args.hidden + k * kMoving + lane);
         const R* weights = args.weights + args.units[k] * kOffsets;
         for (int c = 0; c < kOffsets; c++) offset[c] = fma(unit, splat<R, N>(weights[c]), offset[c]);
