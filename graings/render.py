@@ -1,6 +1,7 @@
 """render: the one path from a scene to an image.
 
-Training, evaluation and serving all use it; scene and rasterizer meet nowhere else.
+Training, evaluation and serving all use it; the last two draw a prepared scene, whose images have the same bits. Scene
+and rasterizer meet nowhere else.
 """
 
 from __future__ import annotations
@@ -51,8 +52,7 @@ def render_composition(
     """As `draw`, without gradients and antialiased: a view coarser than the training views is supersampled.
 
     The rasterizer samples only the centre of each pixel. Without supersampling an image of half the training size is 2
-    to 7 dB worse, and one of a quarter 8 to 17 dB (docs/experiments/). Most of the time of an image goes to the
-    networks, so the additional pixels cost little.
+    to 7 dB worse, and one of a quarter 8 to 17 dB (docs/experiments/).
     """
     parts = supersampling(composition, camera)
     with torch.no_grad():
