@@ -10,7 +10,7 @@ which do not count what other processes take. `before_ms` (--before) is the path
 then `rasterize`; its image must have the same bits. `first_ms` is the first view after a model was read: preparation
 and `render`.
 
-A line a PNG level follows: size and milliseconds of one image.
+Lines for the PNG levels follow: size and CPU milliseconds of one image.
 
 The models of docs/experiments/serving.md:
 
