@@ -29,7 +29,7 @@ from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.evaluation.evaluate import evaluate, subset
-from graings.render import render
+from graings.render import PreparedScene, render
 from graings.storage.checkpoint import load_model
 from graings.storage.model import Model
 
@@ -41,7 +41,8 @@ SHOWN = (4, 6)
 def clip(model: Model, view: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
     """(colors [T, H, W, 3] in [0, 1], alphas [T, H, W]) of one held-out camera at `frames` times over [0, 1]."""
     camera = model.views["val"][view].camera
-    results = [render(model.scene, camera, float(t), model.background) for t in np.linspace(0, 1, frames)]
+    scene = PreparedScene(model.scene)
+    results = [render(scene, camera, float(t), model.background) for t in np.linspace(0, 1, frames)]
     colors = np.stack([result.color.clamp(0, 1).numpy() for result in results])
     return colors, np.stack([result.alpha.numpy().reshape(colors.shape[1:3]) for result in results])
 

@@ -1,6 +1,7 @@
 """render: the one path from a scene to an image.
 
-Training, evaluation and serving all use it; scene and rasterizer meet nowhere else.
+Training, evaluation and serving all use it; the last two draw a prepared scene, whose images have the same bits. Scene
+and rasterizer meet nowhere else.
 """
 
 from __future__ import annotations
@@ -17,27 +18,32 @@ from torch import Tensor
 from graings.camera.camera import Camera
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
-from graings.scene.scene import Composition, Scene
+from graings.scene.prepared import PreparedScene as PreparedScene  # part of this module's interface too
+from graings.scene.scene import Composed, Scene
 
 # Upper bound of the supersampled image: four pixels for each of 1920 x 1080, in 200 MB.
 MAX_SUPERSAMPLED_PIXELS: Final = 1 << 23
 
 
 def render(
-    scene: Scene,
+    scene: Scene | PreparedScene,
     camera: Camera,
     time: float,
     background: Sequence[float],
     *,
     settings: RasterSettings | None = None,
 ) -> RenderResult:
-    """The scene at `time` in [0, 1] from `camera` on a `background` RGB in [0, 1], without gradients."""
+    """The scene at `time` in [0, 1] from `camera` on a `background` RGB in [0, 1], without gradients.
+
+    A `Scene` is prepared for this one image. Whoever renders more of them prepares it once (`PreparedScene`).
+    """
+    prepared = PreparedScene(scene) if isinstance(scene, Scene) else scene
     with torch.inference_mode():
-        return render_composition(scene.compose(camera.center, time), camera, background, settings=settings)
+        return render_composition(prepared.compose(camera.center, time), camera, background, settings=settings)
 
 
 def render_composition(
-    composition: Composition,
+    composition: Composed,
     camera: Camera,
     background: Sequence[float],
     *,
@@ -46,8 +52,7 @@ def render_composition(
     """As `draw`, without gradients and antialiased: a view coarser than the training views is supersampled.
 
     The rasterizer samples only the centre of each pixel. Without supersampling an image of half the training size is 2
-    to 7 dB worse, and one of a quarter 8 to 17 dB (docs/experiments/). Most of the time of an image goes to the
-    networks, so the additional pixels cost little.
+    to 7 dB worse, and one of a quarter 8 to 17 dB (docs/experiments/).
     """
     parts = supersampling(composition, camera)
     with torch.no_grad():
@@ -64,7 +69,7 @@ def render_composition(
         )
 
 
-def supersampling(composition: Composition, camera: Camera) -> int:
+def supersampling(composition: Composed, camera: Camera) -> int:
     """Samples per pixel along each axis that make `camera` sample the scene as finely as the training views did."""
     limit = max(1, math.isqrt(MAX_SUPERSAMPLED_PIXELS // (camera.width * camera.height)))
     return max(1, math.ceil(min(composition.sampling.undersampling(camera), limit)))
@@ -79,7 +84,7 @@ def _box_average(fine: Float[Tensor, "fine_height fine_width *channel"], parts: 
 
 
 def draw(
-    composition: Composition,
+    composition: Composed,
     camera: Camera,
     background: Sequence[float],
     *,
@@ -101,7 +106,7 @@ def draw(
     )
 
 
-def low_pass(composition: Composition, camera: Camera) -> float:
+def low_pass(composition: Composed, camera: Camera) -> float:
     """Variance in px^2 of the low-pass filter for `camera`: a constant width in the scene, not in pixels.
 
     It equals the composition's own `blur` at the reference sampling rate of the training views. A constant width in

@@ -1,4 +1,4 @@
-"""Rendering: loaded models, and a pool of threads that renders images of them.
+"""Rendering: loaded models, prepared for it, and a pool of threads that renders images of them.
 
 Models are identified by path and modification time. Models and images are kept until they exceed a number of bytes;
 the least recently used one is discarded first.
@@ -20,7 +20,7 @@ import numpy as np
 from graings.camera.camera import Camera
 from graings.errors import CheckpointError
 from graings.image_encoding import ImageFormat, encode_image
-from graings.render import render
+from graings.render import PreparedScene, render
 from graings.storage.compact import open_model
 from graings.storage.model import Model, scene_bytes
 from graings.storage.run_folder import newest_model
@@ -41,15 +41,28 @@ class RenderRequest:
     format: ImageFormat
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedModel:
+    """A model in memory, prepared for rendering."""
+
+    model: Model
+    scene: PreparedScene
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it takes."""
+        return scene_bytes(self.model.scene) + self.scene.bytes
+
+
 class ModelCache:
     """Models in memory, at most `max_bytes` of them or one. `load` may be called from several threads."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
-        self._loaded: OrderedDict[_Key, Model] = OrderedDict()
+        self._loaded: OrderedDict[_Key, LoadedModel] = OrderedDict()
         self._guard = threading.Lock()
 
-    def load(self, run: Path) -> Model | None:
+    def load(self, run: Path) -> LoadedModel | None:
         """The model of a run folder, from its newest readable checkpoint, or None. Raises `CheckpointError`."""
         # One at a time, so that two requests for the same new checkpoint read it once.
         with self._guard:
@@ -57,8 +70,8 @@ class ModelCache:
             if newest is None:
                 return None
             key = _key(newest)
-            model = self._loaded.get(key) if key else None
-            if model is None:
+            loaded = self._loaded.get(key) if key else None
+            if loaded is None:
                 try:
                     model = open_model(run)
                 except CheckpointError:
@@ -67,17 +80,18 @@ class ModelCache:
                     model = open_model(run)  # training removed this checkpoint while it was read
                 if newest_model(run) != newest:
                     key = _key(model.path)
+                loaded = LoadedModel(model, PreparedScene(model.scene))
                 if key:
                     self._discard(newest.parent)
-                    self._loaded[key] = model
+                    self._loaded[key] = loaded
             if key:
                 self._loaded.move_to_end(key)
             while len(self._loaded) > 1 and self._bytes() > self._max_bytes:
                 self._loaded.popitem(last=False)
-            return model
+            return loaded
 
     def _bytes(self) -> int:
-        return sum(scene_bytes(model.scene) for model in self._loaded.values())
+        return sum(loaded.bytes for loaded in self._loaded.values())
 
     def _discard(self, folder: Path) -> None:
         """Discard the older models of the same run."""
@@ -102,7 +116,7 @@ class RenderPool:
         """Number of different images that are being rendered or wait for a thread."""
         return len(self._running)
 
-    async def render(self, model: Model, request: RenderRequest, key: str) -> bytes:
+    async def render(self, loaded: LoadedModel, request: RenderRequest, key: str) -> bytes:
         """The encoded image; `key` identifies it with the model."""
         kept = self._kept.get(key)
         if kept is not None:
@@ -110,7 +124,7 @@ class RenderPool:
             return kept
         running = self._running.get(key)
         if running is None:
-            running = asyncio.get_running_loop().run_in_executor(self._executor, _rendered, model, request)
+            running = asyncio.get_running_loop().run_in_executor(self._executor, _rendered, loaded, request)
             self._running[key] = running
             running.add_done_callback(lambda done: self._ended(key, done))
         return await asyncio.shield(running)  # a client that goes away does not end it for the others
@@ -135,8 +149,8 @@ def _lower_priority() -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICE))
 
 
-def _rendered(model: Model, request: RenderRequest) -> bytes:
-    result = render(model.scene, request.camera, request.time, request.background)
+def _rendered(loaded: LoadedModel, request: RenderRequest) -> bytes:
+    result = render(loaded.scene, request.camera, request.time, request.background)
     return encode_image(np.asarray(result.color, dtype=np.float32), request.format)
 
 

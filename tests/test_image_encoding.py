@@ -37,6 +37,27 @@ def test_png_holds_the_nearest_eight_bit_values(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.rint(decoded * 255.0), np.rint(image * 255.0))
 
 
+@pytest.mark.parametrize("level", [None, 0, 1, 6, 9])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (130, 257)])
+def test_png_keeps_every_pixel_at_every_level(shape: tuple[int, int], level: int | None, tmp_path: Path) -> None:
+    """Noise beside a plain part: rows that differ in both directions, and runs longer than deflate's 258."""
+    levels = np.random.default_rng(0).integers(0, 256, (*shape, 3))
+    levels[shape[0] // 2 :] = 17
+    data = encode_image(levels / 255.0, "png", png_level=level)
+    decoded = decode(data, "png", tmp_path)
+    np.testing.assert_array_equal(np.rint(decoded * 255.0).reshape(levels.shape), levels)
+
+
+def test_a_higher_png_level_is_smaller_and_for_png_only() -> None:
+    image = gradient(200, 300)
+    stored, fast, small = (len(encode_image(image, png_level=level)) for level in (0, 1, 9))
+    assert small < fast < stored
+    assert len(encode_image(image)) < stored / 4
+    for level, format in ((10, "png"), (-1, "png"), (3, "jpeg")):
+        with pytest.raises(ValueError, match="png_level"):
+            encode_image(image, image_format(format), png_level=level)
+
+
 def test_exr_holds_half_floats_even_outside_the_unit_range(tmp_path: Path) -> None:
     image = gradient() * 3.0 - 1.0
     decoded = decode(encode_image(image, "exr"), "exr", tmp_path)

@@ -24,10 +24,10 @@ PACKAGES = Path(__file__).resolve().parent.parent / "graings"
 def test_a_time_that_is_not_a_vector_of_one_number_is_refused(time: torch.Tensor) -> None:
     scene = tiny_scene(anchors=4)
     assert scene.residual is not None
-    features, directions = scene.scaffold.features, torch.nn.functional.normalize(torch.ones(4, 3))
-    assert scene.residual(features, torch.tensor([0.5]), directions).shape == (4, 3, 4)
+    part, directions = scene.residual.part(scene.scaffold.features), torch.nn.functional.normalize(torch.ones(4, 3))
+    assert scene.residual(part, torch.tensor([0.5]), directions).shape == (4, 3, 4)
     with pytest.raises(TypeCheckError, match="parameter 'time'"):
-        scene.residual(features, time, directions)
+        scene.residual(part, time, directions)
 
 
 def test_every_dimension_of_a_shape_is_written_as_a_string() -> None:

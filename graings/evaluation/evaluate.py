@@ -11,6 +11,7 @@ from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.evaluation.metrics import Lpips, SplitMetrics, measure_split
 from graings.render import render
+from graings.scene.prepared import PreparedScene
 from graings.scene.scene import Scene
 
 
@@ -23,10 +24,11 @@ def evaluate(
     lpips: Lpips | None = None,
 ) -> SplitMetrics:
     """Metrics of `scene` on `frames`: each view rendered at its own camera and time."""
+    prepared = PreparedScene(scene)
 
     def pairs() -> Iterator[tuple[str, float, ArrayLike, ArrayLike]]:
         for frame in frames:
-            rendered = render(scene, frame.camera, frame.time, background)
+            rendered = render(prepared, frame.camera, frame.time, background)
             yield frame.name, frame.time, rendered.color.clamp(0, 1).numpy(), images.rgb(frame)
 
     return measure_split(pairs(), lpips)

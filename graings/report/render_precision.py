@@ -36,7 +36,8 @@ from graings.report.work_precision_document import (
     RenderReference,
     RenderSetting,
 )
-from graings.scene.scene import Composition
+from graings.scene.prepared import PreparedScene
+from graings.scene.scene import Composed
 from graings.storage.model import Model
 
 VIEWS: Final = 4
@@ -89,11 +90,12 @@ def render_part(name: str, model: Model, *, views: int = VIEWS, budget_s: float 
     """
     load = os.getloadavg()[0]
     sweep = settings()
+    prepared = PreparedScene(model.scene, kept_times=0)  # every frame counts as one of a new time
     with torch.inference_mode():
-        split, chosen = _views(model, views, budget_s / (len(sweep) * (WARM_UPS + MIN_ROUNDS + 1)))
-        frames = [_Frame.of(model, view) for view in chosen]
+        split, chosen = _views(model, prepared, views, budget_s / (len(sweep) * (WARM_UPS + MIN_ROUNDS + 1)))
+        frames = [_Frame.of(model, prepared, view) for view in chosen]
         errors = [_error(model, frames, setting) for setting in sweep]
-        raster_times, network_times = _times(model, frames, sweep, budget_s)
+        raster_times, network_times = _times(model, prepared, frames, sweep, budget_s)
     costs = [_milliseconds(times, network_times) for times in raster_times]
     front = pareto([cost.median for cost in costs], [error.rmse for error in errors])
     return RenderPart(
@@ -125,12 +127,12 @@ class _Frame:
     """One view, the Gaussians it shows and its reference image."""
 
     view: View
-    composition: Composition
+    composition: Composed
     reference: Tensor  # [H, W, 3] float64
 
     @staticmethod
-    def of(model: Model, view: View) -> _Frame:
-        composition = model.scene.compose(view.camera.center, view.time)
+    def of(model: Model, prepared: PreparedScene, view: View) -> _Frame:
+        composition = prepared.compose(view.camera.center, view.time)
         names = ("means", "quats", "log_scales", "opacities", "colors")
         double = {name: getattr(composition.gaussians, name).double() for name in names}
         exact = replace(composition, gaussians=replace(composition.gaussians, **double))
@@ -145,7 +147,7 @@ class _Frame:
         return render_composition(self.composition, camera, model.background, settings=raster).color
 
 
-def _views(model: Model, count: int, seconds: float) -> tuple[Split, tuple[View, ...]]:
+def _views(model: Model, prepared: PreparedScene, count: int, seconds: float) -> tuple[Split, tuple[View, ...]]:
     """At most `count` views that together take about `seconds` to render, but at least one."""
     split = next((split for split in HELD_OUT_FIRST if model.views.get(split)), None)
     if split is None:
@@ -153,7 +155,7 @@ def _views(model: Model, count: int, seconds: float) -> tuple[Split, tuple[View,
     views = model.views[split]
     for _ in range(2):  # the first one is slower: caches are cold
         started = time.perf_counter()
-        draw(model.scene.compose(views[0].camera.center, views[0].time), views[0].camera, model.background)
+        draw(prepared.compose(views[0].camera.center, views[0].time), views[0].camera, model.background)
         duration = time.perf_counter() - started
     number = max(1, min(count, len(views), int(seconds / duration)))
     return split, tuple(views[i * len(views) // number] for i in range(number))
@@ -183,7 +185,11 @@ def _error(model: Model, frames: Sequence[_Frame], setting: RenderSetting) -> Re
 
 
 def _times(
-    model: Model, frames: Sequence[_Frame], sweep: Sequence[RenderSetting], budget_s: float
+    model: Model,
+    prepared: PreparedScene,
+    frames: Sequence[_Frame],
+    sweep: Sequence[RenderSetting],
+    budget_s: float,
 ) -> tuple[list[list[float]], list[float]]:
     """Seconds of a frame, mean over `frames`, in each round: to rasterize with each setting, and of the networks."""
     raster_times: list[list[float]] = [[] for _ in sweep]
@@ -191,7 +197,7 @@ def _times(
     for number in _rounds(budget_s):
         started = time.perf_counter()
         for frame in frames:
-            model.scene.compose(frame.view.camera.center, frame.view.time)
+            prepared.compose(frame.view.camera.center, frame.view.time)
         if number >= 0:
             network_times.append((time.perf_counter() - started) / len(frames))
         for times, setting in zip(raster_times, sweep, strict=True):

@@ -6,6 +6,7 @@ Every head is evaluated once per anchor and outputs one value per child slot.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int64
@@ -19,7 +20,15 @@ from graings.scene.encoding import (
     encoding_width,
     frequency_encoding,
 )
-from graings.scene.perceptron import perceptron, weights_and_biases
+from graings.scene.perceptron import GroupBias, perceptron, weights_and_biases
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColorPart:
+    """What the colour head needs of each anchor's feature: the same for all views."""
+
+    hidden: GroupBias  # the feature's part of the first layer, bias included; a group for each anchor
+    normals: Float[Tensor, "anchor 3"] | None  # at which the viewing direction is reflected
 
 
 class CanonicalAppearance(nn.Module):
@@ -49,16 +58,26 @@ class CanonicalAppearance(nn.Module):
             last.weight.mul_(0.1)  # all children start with nearly the same opacity, above the rendering threshold
             last.bias.fill_(math.atanh(initial_opacity))
 
+    def color_part(self, features: Float[Tensor, "anchor feature"]) -> ColorPart:
+        """What `colors` needs of the features, for any number of views."""
+        first = self.color[0]
+        assert isinstance(first, nn.Linear)
+        hidden = perceptron(features, [first.weight[:, : features.shape[-1]]], [first.bias])
+        return ColorPart(_per_row(hidden), None if self.normal is None else self.normal(features))
+
+    def color_layers(self, part: ColorPart) -> tuple[list[Tensor], list[Tensor]]:
+        """Weights and biases that remain of the colour head once the features' part of its first layer is known."""
+        weights, biases = weights_and_biases(self.color)
+        encodings = 1 if part.normals is None else 2
+        directions = encodings * direction_width(self.color_sh_degree)
+        return [weights[0][:, -directions:], weights[1]], [torch.zeros_like(biases[0]), biases[1]]
+
     def colors(
-        self,
-        features: Float[Tensor, "anchor feature"],
-        directions: Float[Tensor, "anchor 3"],
-        children: Int64[Tensor, " gaussian"],
+        self, part: ColorPart, directions: Float[Tensor, "anchor 3"], children: Int64[Tensor, " gaussian"]
     ) -> Float[Tensor, "gaussian 3"]:
         """c_can (Eq. 11) of the given flat child slots (anchor * k + child)."""
-        normals = None if self.normal is None else self.normal(features)
-        inputs = torch.cat([features, direction_encoding(directions, self.color_sh_degree, normals)], dim=-1)
-        raw = perceptron(inputs, *weights_and_biases(self.color))
+        inputs = direction_encoding(directions, self.color_sh_degree, part.normals)
+        raw = perceptron(inputs, *self.color_layers(part), shared=part.hidden)
         return sigmoid(raw.view(-1, 3).index_select(0, children))
 
     def opacity_logits(
@@ -81,11 +100,25 @@ class CanonicalAppearance(nn.Module):
         bound: Tensor = highest @ weights[1].clamp_min(0).T + lowest @ weights[1].clamp_max(0).T + biases[1]
         return bound
 
+    def opacity_rounding(self, features: Float[Tensor, "anchor feature"]) -> Float[Tensor, "anchor child"]:
+        """Upper bound of the rounding errors of `opacity_logits` and `highest_opacity_logits` together.
+
+        A sum of n products is off by at most n u / (1 - n u) times the sum of their magnitudes, u half of `eps`; ReLU
+        passes an error on unchanged, so those of two layers add up to n_1 + n_2 times the magnitudes through both.
+        """
+        weights, biases = [[tensor.abs() for tensor in tensors] for tensors in weights_and_biases(self.opacity)]
+        width = features.shape[-1]
+        first = features.abs() @ weights[0][:, :width].T + weights[0][:, width:].norm(dim=-1) + biases[0]
+        terms = sum(weight.shape[1] + 4 for weight in weights)  # biases and the length of the direction besides
+        magnitudes: Tensor = first @ weights[1].T + biases[1]
+        return 2 * terms * torch.finfo(features.dtype).eps * magnitudes
+
 
 class TemporalHead(nn.Module):
     """A network with one hidden layer and the encoded time as a further input; its output is zero at initialization.
 
-    The time's part of the hidden layer is computed once and added as a bias for all rows.
+    The features' part of the hidden layer is computed once for all times and directions, the time's part once for all
+    rows.
     """
 
     def __init__(self, config: SceneConfig, inputs: int, outputs: int) -> None:
@@ -96,12 +129,37 @@ class TemporalHead(nn.Module):
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
+    def feature_part(self, features: Float[Tensor, "row feature"]) -> GroupBias:
+        """The features' part of the hidden layer, bias included: the same for all times and directions."""
+        weight = self.from_feature.weight[:, : features.shape[-1]]
+        return _per_row(perceptron(features, [weight], [self.from_feature.bias]))
+
+    def other_weights(self, others: int) -> list[Tensor]:
+        """Weights that remain once the part of the features is known; the last `others` inputs are not features."""
+        first = self.from_feature.weight
+        return [first[:, first.shape[1] - others :], self.out.weight]
+
+    def biases(self, encoded_time: Float[Tensor, " time"]) -> list[Tensor]:
+        """The biases that go with `other_weights` at a time."""
+        return [self.from_time(encoded_time), self.out.bias]
+
     def predict(
-        self, inputs: Float[Tensor, "row input"], encoded_time: Float[Tensor, " time"]
+        self,
+        part: GroupBias,
+        encoded_time: Float[Tensor, " time"],
+        others: Float[Tensor, "row other"] | None = None,
     ) -> Float[Tensor, "row output"]:
-        """The output for each row of `inputs` at the time whose encoding is `encoded_time`."""
-        biases = [self.from_feature.bias + self.from_time(encoded_time), self.out.bias]
-        return perceptron(inputs, [self.from_feature.weight, self.out.weight], biases)
+        """The output for each row of `feature_part`, with further inputs, at the time encoded by `encoded_time`."""
+        inputs = part.values.new_empty(len(part.values), 0) if others is None else others
+        return perceptron(inputs, self.other_weights(inputs.shape[1]), self.biases(encoded_time), shared=part)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualPart:
+    """What the residual needs of each anchor's feature: the same for all times and views."""
+
+    time_only: GroupBias
+    seeing: GroupBias | None
 
 
 class ResidualField(TemporalHead):
@@ -124,21 +182,32 @@ class ResidualField(TemporalHead):
             TemporalHead(config, config.feature_dim + view_inputs, 3 * config.children) if view_inputs else None
         )
 
+    def part(self, features: Float[Tensor, "anchor feature"]) -> ResidualPart:
+        """What the residual needs of the features, for any number of times and views."""
+        return ResidualPart(
+            self.feature_part(features), None if self.seeing is None else self.seeing.feature_part(features)
+        )
+
     def forward(
-        self,
-        features: Float[Tensor, "anchor feature"],
-        time: Float[Tensor, " 1"],
-        directions: Float[Tensor, "anchor 3"],
+        self, part: ResidualPart, time: Float[Tensor, " 1"], directions: Float[Tensor, "anchor 3"]
     ) -> Float[Tensor, "anchor child 4"]:
         """(Delta c, Delta o) of every slot at `time` in [0, 1], before the bound eta tanh of Eq. 12."""
-        encoded_time = frequency_encoding(time, self.time_frequencies)
-        time_only = self.predict(features, encoded_time)
-        if self.seeing is None:
+        encoded_time = self.encoded(time)
+        time_only = self.predict(part.time_only, encoded_time)
+        if self.seeing is None or part.seeing is None:
             return time_only.unflatten(-1, (-1, 4))
-        inputs = torch.cat([features, direction_encoding(directions, self.sh_degree)], dim=-1)
-        view_dependent = self.seeing.predict(inputs, encoded_time).unflatten(-1, (-1, 3))
-        return torch.cat([view_dependent, time_only.unsqueeze(-1)], dim=-1)
+        view_dependent = self.seeing.predict(part.seeing, encoded_time, direction_encoding(directions, self.sh_degree))
+        return torch.cat([view_dependent.unflatten(-1, (-1, 3)), time_only.unsqueeze(-1)], dim=-1)
+
+    def encoded(self, time: Float[Tensor, " 1"]) -> Float[Tensor, " width"]:
+        """gamma(t), which both heads receive."""
+        return frequency_encoding(time, self.time_frequencies)
 
     def bounded(self, raw: Float[Tensor, "*rows"]) -> Float[Tensor, "*rows"]:
         """eta tanh(`raw`), within (-eta, eta), Eq. 12."""
         return self.scale * tanh(raw)
+
+
+def _per_row(values: Float[Tensor, "row width"]) -> GroupBias:
+    """A bias of the first layer for each row."""
+    return GroupBias(values, torch.arange(len(values)))

@@ -70,20 +70,35 @@ class DeformationNetwork(nn.Module):
         With factorized time the hidden layers run once for all times: each further time adds ten outputs.
         """
         encoded_positions = frequency_encoding(positions, self.position_frequencies)
-        encoded_times = frequency_encoding(times, self.time_frequencies)
-        weights, biases = weights_and_biases([self.from_position, *self.hidden, self.out])
+        weights, biases = self._layers()
         if self.psi is not None:
-            weights[-1] = (weights[-1] * self.psi(encoded_times).unsqueeze(1)).flatten(0, 1)
-            biases[-1] = biases[-1].repeat(len(times))
+            weights[-1], biases[-1] = self.output_layer(times)
             return perceptron(encoded_positions, weights, biases).unflatten(1, (len(times), -1)).transpose(0, 1)
         assert self.from_time is not None
         first, *others = biases
         return torch.stack(
             [
                 perceptron(encoded_positions, weights, [first + from_time, *others])
-                for from_time in self.from_time(encoded_times)
+                for from_time in self.from_time(frequency_encoding(times, self.time_frequencies))
             ]
         )
+
+    def hidden_units(self, positions: Float[Tensor, "gaussian 3"]) -> Float[Tensor, "gaussian width"]:
+        """phi of `positions` in units of the scene's extent: what factorized offsets need beside `output_layer`."""
+        weights, biases = self._layers()
+        encoded = frequency_encoding(positions, self.position_frequencies)
+        return perceptron(encoded, weights[:-1], biases[:-1]).relu()
+
+    def output_layer(
+        self, times: Float[Tensor, "time 1"]
+    ) -> tuple[Float[Tensor, "output width"], Float[Tensor, " output"]]:
+        """Weights W psi(t) and biases of factorized offsets, ten outputs for each of `times`, one after the other."""
+        assert self.psi is not None
+        amplitudes = self.psi(frequency_encoding(times, self.time_frequencies))
+        return (self.out.weight * amplitudes.unsqueeze(1)).flatten(0, 1), self.out.bias.repeat(len(times))
+
+    def _layers(self) -> tuple[list[Tensor], list[Tensor]]:
+        return weights_and_biases([self.from_position, *self.hidden, self.out])
 
 
 def time_modules(config: SceneConfig) -> tuple[nn.Linear | None, nn.Sequential | None]:

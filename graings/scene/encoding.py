@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from graings import kernel
+from graings import constants, kernel
 
 # Added to a normal's squared length, here and in the kernel: for a length below 1e-3 the reflection fades out, because
 # the direction of so short a normal is noise.
@@ -56,6 +58,14 @@ def reflected(directions: Float[Tensor, "*batch 3"], normals: Float[Tensor, "*ba
     """
     squared = normals.square().sum(dim=-1, keepdim=True) + _NORMAL_EPSILON
     return directions - 2 * ((directions * normals).sum(dim=-1, keepdim=True) / squared) * normals
+
+
+def directions_from(eye: ArrayLike, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Unit vectors from `eye` [3] to `positions`, which get no gradient; shorter within `constants.NEAR` of the eye."""
+    directions = torch.empty_like(positions)
+    at = np.asarray(eye, dtype=np.float64).ravel()
+    kernel.kernel().directions(positions.detach().contiguous(), at, constants.NEAR, directions, kernel.thread_count())
+    return directions
 
 
 def direction_width(degree: int) -> int:

@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from numpy.typing import ArrayLike
@@ -28,24 +27,31 @@ from graings.scene.canonical import INITIAL_SCALE, StaticMLP, default_geometry
 from graings.scene.children import Children, compose, gather
 from graings.scene.clip import clip
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP, deformation_from
+from graings.scene.encoding import directions_from
 from graings.scene.scaffold import Scaffold
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Composition:
+class Composed:
+    """The Gaussians of one view, and what drawing them needs beside."""
+
+    gaussians: Gaussians
+    children: Int64[Tensor, " gaussian"]  # flat slot (anchor * k + child) of each Gaussian
+    blur: float  # variance of the low-pass filter used in training, px^2 at the sampling rate `sampling`
+    sampling: SamplingRate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Composition(Composed):
     """The Gaussians of one view, with everything the losses and the growth statistics read.
 
     They include children that only another view, composed together with this one, renders.
     """
 
-    gaussians: Gaussians
-    children: Int64[Tensor, " gaussian"]  # flat slot (anchor * k + child) of each Gaussian
     canonical_means: Float[Tensor, "gaussian 3"]  # x_can
     deformation: Deformation | None
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
     opacities: Float[Tensor, "anchor child"]  # score of every slot, no gradient: o(t) of candidates, else o_can
-    blur: float  # variance of the low-pass filter used in training, px^2 at the sampling rate `sampling`
-    sampling: SamplingRate
 
 
 class Scene(nn.Module):
@@ -129,8 +135,9 @@ class Scene(nn.Module):
         directions = [direction.index_select(0, candidates) for direction in directions]
         residuals: list[Tensor | None] = [None] * len(views)
         if residual_field is not None:
+            residual_part = residual_field.part(residual_features)
             residuals = [
-                residual_field(residual_features, torch.tensor([time], dtype=features.dtype), direction)
+                residual_field(residual_part, torch.tensor([time], dtype=features.dtype), direction)
                 for time, direction in zip(times, directions, strict=True)
             ]
             opacities = [
@@ -141,16 +148,15 @@ class Scene(nn.Module):
         rendered = (highest > constants.ALPHA_MIN).nonzero().squeeze(-1)  # among the slots of the candidates
         slot_indices = candidates[rendered // slots] * slots + rendered % slots
 
-        children = gather(scaffold, slot_indices)
-        if self.log_unit is not None:
-            children = replace(children, anchor_log_scales=torch.full_like(children.canonical_means, self.log_unit))
+        color_part = self.appearance.color_part(features)
+        children = self.gathered(slot_indices)
         uids = scaffold.child_uids(slot_indices)
         extent = float(self.extent)
         compositions = []
-        geometries = self._predicted_geometry(children, slot_indices, times)
+        geometries = self.predicted_geometry(children, slot_indices, times)
         per_view = zip(canonical_opacities, opacities, residuals, directions, geometries, strict=True)
         for canonical_opacity, opacity, residual, direction, (canonical, raw) in per_view:
-            colors = self.appearance.colors(features, direction, rendered)
+            colors = self.appearance.colors(color_part, direction, rendered)
             rendered_residual = None
             if residual_field is not None and residual is not None:
                 rendered_residual = residual_field.bounded(residual.flatten(0, 1).index_select(0, rendered))
@@ -191,9 +197,14 @@ class Scene(nn.Module):
 
     def directions(self, eye: ArrayLike) -> Float[Tensor, "anchor 3"]:
         """Viewing direction v of Eq. 11: unit vectors from the camera centre `eye` [3] to every anchor."""
-        anchors = self.scaffold.anchors
-        offsets = anchors - torch.as_tensor(np.asarray(eye, dtype=np.float64), dtype=anchors.dtype)
-        return offsets / offsets.norm(dim=-1, keepdim=True).clamp_min(constants.NEAR)
+        return directions_from(eye, self.scaffold.anchors)
+
+    def gathered(self, slots: Int64[Tensor, " gaussian"]) -> Children:
+        """Inputs of the geometry networks for the children at the given flat slots, ascending (Eq. 4)."""
+        children = gather(self.scaffold, slots)
+        if self.log_unit is None:
+            return children
+        return replace(children, anchor_log_scales=torch.full_like(children.canonical_means, self.log_unit))
 
     def deform(
         self, children: Int64[Tensor, " gaussian"], canonical_means: Float[Tensor, "gaussian 3"], time: float
@@ -205,12 +216,12 @@ class Scene(nn.Module):
         if not self.temporal or (self.deformation is None and self.single is None):
             return None
         if self.single is not None:
-            raw = self._single_mlp(self.single, gather(self.scaffold, children), canonical_means, time)[:, 7:]
+            raw = self._single_mlp(self.single, self.gathered(children), canonical_means, time)[:, 7:]
         else:
             raw = self._predicted_deformation(children, canonical_means, [time])[0]
         return deformation_from(raw, float(self.extent))
 
-    def _predicted_geometry(
+    def predicted_geometry(
         self, children: Children, slot_indices: Tensor, times: Sequence[float]
     ) -> list[tuple[Tensor, Tensor | None]]:
         """Outputs of the geometry networks at each time: canonical geometry, and the deformation or None (static)."""
@@ -233,17 +244,17 @@ class Scene(nn.Module):
         time_rows = torch.tensor(times, dtype=canonical_means.dtype).unsqueeze(-1)
         if self.config.deformation == "anchor":
             anchors, owners = torch.unique(slot_indices // self.scaffold.slots, return_inverse=True)
-            positions = self._network_positions(self.scaffold.anchors.index_select(0, anchors))
+            positions = self.network_positions(self.scaffold.anchors.index_select(0, anchors))
             shared = self.deformation(positions, time_rows)
             return [raw.index_select(0, owners) for raw in shared.unbind(0)]
-        return list(self.deformation(self._network_positions(canonical_means), time_rows).unbind(0))
+        return list(self.deformation(self.network_positions(canonical_means), time_rows).unbind(0))
 
     def _single_mlp(self, single: SingleMLP, children: Children, canonical_means: Tensor, time: float | None) -> Tensor:
         time_row = None if time is None else torch.tensor([time], dtype=canonical_means.dtype)
-        output: Tensor = single(self.scaffold.features, children, self._network_positions(canonical_means), time_row)
+        output: Tensor = single(self.scaffold.features, children, self.network_positions(canonical_means), time_row)
         return output
 
-    def _network_positions(self, canonical_means: Tensor) -> Tensor:
+    def network_positions(self, canonical_means: Tensor) -> Tensor:
         """sg(x_can) of Eq. 7 in units of the extent; without the stop-gradient where so configured."""
         return (canonical_means.detach() if self.config.stop_gradient else canonical_means) / self.extent
 

@@ -14,6 +14,7 @@ from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.evaluation.metrics import Lpips, SplitMetrics, measure_split
 from graings.render import render_composition
+from graings.scene.prepared import PreparedScene
 from graings.scene.scene import Scene
 from graings.training.guard.stiffness import SubpixelCounter
 
@@ -22,8 +23,8 @@ from graings.training.guard.stiffness import SubpixelCounter
 class HeldOut:
     """What one pass over some views measured.
 
-    `frames_per_second` is the median over the views but the first, networks included, encoding not; `subpixel_share`
-    is f_sub of these views (`graings.training.guard.stiffness`).
+    `frames_per_second` is the median over the views but the first, without encoding and without preparing the scene;
+    `subpixel_share` is f_sub of these views (`graings.training.guard.stiffness`).
     """
 
     metrics: SplitMetrics
@@ -40,12 +41,13 @@ class HeldOut:
     ) -> HeldOut:
         """Draw each of at least one view in `frames` once."""
         footprints, seconds = SubpixelCounter(scene), list[float]()
+        prepared = PreparedScene(scene, kept_times=0)  # every view counts as one of a new time
 
         def pairs() -> Iterator[tuple[str, float, ArrayLike, ArrayLike]]:
             for frame in frames:
                 started = time.perf_counter()
                 with torch.inference_mode():
-                    composition = scene.compose(frame.camera.center, frame.time)
+                    composition = prepared.compose(frame.camera.center, frame.time)
                     result = render_composition(composition, frame.camera, background)
                 seconds.append(time.perf_counter() - started)
                 footprints.add(composition, result.radii, frame.camera)

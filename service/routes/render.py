@@ -24,7 +24,7 @@ from graings.storage.model import Model
 from jobs.job import JobNotFound
 from service.context import Context, ContextDep
 from service.problems import RESPONSES, BadRequest, NotAcceptable, NotYet
-from service.rendering import RenderRequest
+from service.rendering import LoadedModel, RenderRequest
 
 router = APIRouter(tags=["render"])
 
@@ -97,7 +97,8 @@ async def render(
 ) -> Response:
     """Render the newest model, or a job's newest checkpoint while it trains, at time `t` from a viewpoint."""
     format = query.format or _format(accept)
-    job_id, model = await to_thread.run_sync(_model, context, query.job)
+    job_id, loaded = await to_thread.run_sync(_model, context, query.job)
+    model = loaded.model
     try:
         view = _view_request(query)
         camera, time, background = view.resolve(model.views, model.units, model.background)
@@ -119,7 +120,7 @@ async def render(
         headers["X-Graings-Orbit"] = _orbit_header(view, camera, model.units)
     if _matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    image = await context.pool.render(model, request, headers["ETag"])
+    image = await context.pool.render(loaded, request, headers["ETag"])
     return Response(image, media_type=MEDIA_TYPES[format], headers=headers)
 
 
@@ -132,7 +133,7 @@ def _format(accept: str | None) -> ImageFormat:
     return offered[media_type]
 
 
-def _model(context: Context, job_id: str | None) -> tuple[str, Model]:
+def _model(context: Context, job_id: str | None) -> tuple[str, LoadedModel]:
     """The model of a job, or of the newest job that has one. Blocks."""
     if job_id is not None:
         model = context.models.load(context.store.folder(job_id).run)

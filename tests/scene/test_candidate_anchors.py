@@ -44,10 +44,10 @@ def all_slots(scene: Scene) -> tuple[Tensor, Tensor]:
     scaffold = scene.scaffold
     slots = torch.arange(scaffold.count * scaffold.slots)
     scores = canonical_opacities(scene)
-    colors = scene.appearance.colors(scaffold.features, scene.directions(EYE), slots)
+    colors = scene.appearance.colors(scene.appearance.color_part(scaffold.features), scene.directions(EYE), slots)
     if scene.residual is not None:
         time = torch.tensor([TIME], dtype=torch.float64)
-        residual = ETA * torch.tanh(scene.residual(scaffold.features, time, scene.directions(EYE)))
+        residual = ETA * torch.tanh(scene.residual(scene.residual.part(scaffold.features), time, scene.directions(EYE)))
         scores, colors = scores + residual[..., 3], (colors + residual[..., :3].flatten(0, 1)).clamp(0, 1)
     return scores.detach(), colors.detach()
 
@@ -73,7 +73,7 @@ def test_the_residual_can_make_an_anchor_visible() -> None:
 
 
 def test_only_candidate_anchors_are_evaluated_for_residual_and_colour() -> None:
-    scene = scene_of()
+    scene = scene_of(feature_dim=7, head_width=9, static_width=10)  # widths that differ from those of directions
     config = scene.config
     candidates = int((canonical_opacities(scene).amax(-1) + ETA > constants.ALPHA_MIN).sum())
     assert config.head_width < candidates < ANCHORS
@@ -85,9 +85,9 @@ def test_only_candidate_anchors_are_evaluated_for_residual_and_colour() -> None:
 
     with torch.autograd.graph.saved_tensors_hooks(record, lambda tensor: tensor):
         scene.compose(EYE, TIME)
-    color_inputs = config.feature_dim + 2 * direction_width(config.color_sh_degree)
-    residual_inputs = config.feature_dim + direction_width(config.residual_sh_degree)
-    for width in (color_inputs, residual_inputs):
+    color_inputs = 2 * direction_width(config.color_sh_degree)
+    residual_inputs = direction_width(config.residual_sh_degree)
+    for width in (color_inputs, residual_inputs, config.head_width):
         assert (candidates, width) in saved
         assert (ANCHORS, width) not in saved
 

@@ -209,6 +209,16 @@ def test_no_rows_give_no_values_and_zero_gradients() -> None:
     assert all(not gradient.any() for gradient in gradients)
 
 
+def test_no_rows_and_no_groups_give_zero_gradients() -> None:
+    given = chain((3, 6, 2), 0)
+    leaves = [t.requires_grad_() for t in (torch.zeros(0, 6).double(), *given.weights, *given.biases)]
+    groups = GroupBias(leaves[0], torch.zeros(0, dtype=torch.int64))
+    output = perceptron(given.inputs, given.weights, given.biases, shared=groups)
+    assert output.shape == (0, 2)
+    output.sum().backward()
+    assert all(leaf.grad is not None and not leaf.grad.any() for leaf in leaves)
+
+
 def test_misuse_is_refused_with_its_reason() -> None:
     given = chain((4, 6, 3), 5)
     with pytest.raises(ValueError, match="layer 1 has 6 inputs"):

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch import Tensor
 
 from graings import kernel
 from graings.config import SceneConfig
@@ -49,11 +50,15 @@ def test_colour_depends_on_the_normal_only_where_reflection_is_on() -> None:
     without = CanonicalAppearance(SceneConfig(children=3, feature_dim=8, reflection=False), 0.1)
     assert without.normal is None
     assert with_reflection.normal is not None
-    before = with_reflection.colors(features, directions, children)
+
+    def colors() -> Tensor:
+        return with_reflection.colors(with_reflection.color_part(features), directions, children)
+
+    before = colors()
     with torch.no_grad():
         with_reflection.normal.bias += 1.0
-    assert not torch.equal(with_reflection.colors(features, directions, children), before)
-    with_reflection.colors(features, directions, children).sum().backward()
+    assert not torch.equal(colors(), before)
+    colors().sum().backward()
     assert with_reflection.normal.weight.grad is not None
     assert with_reflection.normal.weight.grad.abs().sum() > 0
 

@@ -18,11 +18,10 @@ from graings.camera.camera import Camera
 from graings.camera.view_request import MAX_SIDE
 from graings.camera.viewpoint import orbit_view
 from graings.image_encoding import encode_image
-from graings.render import render
+from graings.render import PreparedScene, render
 from graings.storage.checkpoint import load_model
-from graings.storage.model import scene_bytes
 from jobs.store import JobFolder
-from service.rendering import ModelCache, RenderPool, RenderRequest
+from service.rendering import LoadedModel, ModelCache, RenderPool, RenderRequest
 from service.settings import Settings
 from tests.service.conftest import ITERATIONS, SIZE
 from tests.service.test_jobs import problem
@@ -236,13 +235,18 @@ def test_a_model_is_loaded_once_until_its_checkpoint_changes(trained: Path, tmp_
     assert models.load(run) is not second  # discarded for the other one
 
 
+def prepared(run: Path) -> LoadedModel:
+    model = load_model(run)
+    return LoadedModel(model, PreparedScene(model.scene))
+
+
 def request_at(time: float) -> RenderRequest:
     camera = Camera.orbit(0.0, 0.0, 3.0, fov=0.7, width=8, height=8)
     return RenderRequest(camera, time, (1.0, 1.0, 1.0), "png")
 
 
 def test_requests_for_one_image_share_its_rendering_and_get_equal_bytes(trained: Path) -> None:
-    model, pool = load_model(trained), RenderPool(slots=2, kept_bytes=0)
+    model, pool = prepared(trained), RenderPool(slots=2, kept_bytes=0)
     images: list[bytes] = []
 
     async def send(time: float) -> None:
@@ -262,7 +266,7 @@ def test_requests_for_one_image_share_its_rendering_and_get_equal_bytes(trained:
 
 
 def test_the_last_images_are_kept_up_to_a_number_of_bytes(trained: Path) -> None:
-    model = load_model(trained)
+    model = prepared(trained)
 
     async def images(kept_bytes: int, times: Sequence[float]) -> list[bytes]:
         pool = RenderPool(slots=1, kept_bytes=kept_bytes)
@@ -281,7 +285,7 @@ def test_the_last_images_are_kept_up_to_a_number_of_bytes(trained: Path) -> None
 
 
 def test_an_image_that_cannot_be_rendered_is_tried_again(trained: Path) -> None:
-    model, pool = load_model(trained), RenderPool(slots=1, kept_bytes=1_000)
+    model, pool = prepared(trained), RenderPool(slots=1, kept_bytes=1_000)
     wrong = replace(request_at(0.0), background=(1.0, 1.0, math.nan))
 
     async def send(request: RenderRequest) -> bytes:
@@ -295,8 +299,7 @@ def test_an_image_that_cannot_be_rendered_is_tried_again(trained: Path) -> None:
 
 def test_models_are_discarded_when_they_exceed_their_memory(trained: Path, tmp_path: Path) -> None:
     runs = [Path(shutil.copytree(trained, tmp_path / name)) for name in ("a", "b", "c")]
-    size = scene_bytes(load_model(trained).scene)
-    models = ModelCache(2 * size)
+    models = ModelCache(2 * prepared(trained).bytes)
     first, second, _ = [models.load(run) for run in runs]
     assert models.load(runs[1]) is second
     assert models.load(runs[0]) is not first

@@ -1,10 +1,7 @@
 // Python bindings. Arrays are passed through DLPack, so the kernel does not depend on torch.
 #include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <iterator>
@@ -15,6 +12,7 @@
 #include <malloc.h>
 #endif
 
+#include "arrays.hpp"
 #include "children.hpp"
 #include "encoding.hpp"
 #include "frame.hpp"
@@ -22,24 +20,9 @@
 #include "perceptron.hpp"
 #include "photometric.hpp"
 
-namespace nb = nanobind;
 using namespace nb::literals;
 
 namespace {
-
-template <class T> using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
-template <class T> using Out = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
-
-template <class Array>
-auto* checked(const Array& array, size_t size, const char* name) {
-    if (array.size() != size)
-        throw std::invalid_argument(std::string(name) + " must have " + std::to_string(size) + " elements, got " + std::to_string(array.size()));
-    return array.data();
-}
-template <class Array>
-auto* checked(const std::optional<Array>& array, size_t size, const char* name) {
-    return array ? checked(*array, size, name) : nullptr;
-}
 
 // Frames take memory addresses, 0 for null: array arguments would cost a fifth of the time of a small frame. The caller
 // has checked shapes, dtypes and contiguity.
@@ -57,28 +40,6 @@ graings::Inputs<R> inputs(int64_t count, Address means, Address quats, Address l
 }
 
 template <class R>
-graings::Network<R> network(const In<R>& input, int64_t rows, const std::vector<In<R>>& weights, const std::vector<In<R>>& biases,
-                            const std::optional<In<R>>& shared, const std::optional<In<int64_t>>& group) {
-    if (weights.empty() || weights.size() > graings::kMaxLayers || biases.size() != weights.size())
-        throw std::invalid_argument("a network has 1 to " + std::to_string(graings::kMaxLayers) + " layers, each with a weight and a bias");
-    graings::Network<R> result;
-    result.widths.push_back(int64_t(weights[0].shape(1)));
-    for (size_t l = 0; l < weights.size(); l++) {
-        const size_t out = weights[l].shape(0);
-        result.weights.push_back(checked(weights[l], out * size_t(result.widths.back()), "weight"));
-        result.biases.push_back(checked(biases[l], out, "bias"));
-        result.widths.push_back(int64_t(out));
-    }
-    checked(input, size_t(rows * result.widths[0]), "input");
-    if (!shared) return result;
-    if (!group) throw std::invalid_argument("shared needs the group of every row");
-    result.groups = int64_t(shared->shape(0));
-    result.shared = checked(*shared, size_t(result.groups * result.widths[1]), "shared");
-    result.group = checked(*group, size_t(rows), "group");
-    return result;
-}
-
-template <class R>
 graings::Anchors<R> anchors(const In<R>& position, const In<R>& log_scale, const In<R>& offset) {
     const size_t count = position.shape(0), slots = offset.shape(1);
     return {int64_t(count), int64_t(slots), position.data(), checked(log_scale, 3 * count, "log_scales"), checked(offset, 3 * count * slots, "offsets")};
@@ -90,12 +51,6 @@ graings::NetworkOutputs<R> network_outputs(const In<R>& canonical, const In<R>& 
     const size_t drawn = base.shape(0);
     return {int64_t(drawn), checked(canonical, 7 * drawn, "canonical"), checked(base, 3 * drawn, "base"), checked(centre, 3 * drawn, "centre"),
             checked(deformation, 10 * drawn, "deformation"), extent, {change, low, high, projected}};
-}
-
-// Number of spherical harmonics of degrees 1 to `degree`.
-size_t harmonics_of(int degree) {
-    if (degree < 1 || degree > 3) throw std::invalid_argument("degree must lie in [1, 3]");
-    return size_t(degree * (degree + 2));
 }
 
 template <class R>
@@ -224,7 +179,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         const R* upstream = checked(v_output, size_t(rows * layers.widths.back()), "v_output");
         R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows)), "hidden");
         R *v_in = checked(v_input, input.size(), "v_input"), *v_common = checked(v_shared, shared ? shared->size() : 0, "v_shared");
-        if (shared && !v_common) throw std::invalid_argument("shared needs v_shared for its gradient");
+        if (shared && !v_shared) throw std::invalid_argument("shared needs v_shared for its gradient");
         if (v_weights.size() != weights.size() || v_biases.size() != weights.size()) throw std::invalid_argument("one gradient per weight and bias");
         std::vector<R*> w, b;
         for (size_t l = 0; l < weights.size(); l++) {
@@ -246,6 +201,8 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
 
 }  // namespace
 
+void bind_prepared(nb::module_&);  // prepared_bindings.cpp
+
 NB_MODULE(_kernel, m) {
     nb::set_leak_warnings(false);  // torch may keep graphs, and with them frames, until the interpreter exits
     m.doc() = "Compiled rasterizer; use graings.raster.rasterize and graings.raster.photometric.";
@@ -253,6 +210,7 @@ NB_MODULE(_kernel, m) {
     bind<double>(m, "FrameDouble", "draw_double");
     bind_children<float>(m);
     bind_children<double>(m);
+    bind_prepared(m);
     m.def("hidden_size", &graings::hidden_size, "widths"_a, "rows"_a, "Elements that a network's hidden activations take.");
     m.def("ssim_constants", [] {
         nb::dict constants;

@@ -1,7 +1,9 @@
 // Compiled once per instruction set (CMakeLists.txt defines GRAINGS_ISA and the flags).
 #include <type_traits>
+#include "activation.hpp"
 #include "geometry.hpp"
 #include "layers.hpp"
+#include "motion.hpp"
 #include "ssim.hpp"
 #include "tile_gradient.hpp"
 #include "tiles.hpp"
@@ -11,7 +13,8 @@ namespace graings {
 namespace GRAINGS_ISA {
 template <class R>
 constexpr Kernels<R> table() {
-    return {project<R>, draw_tile<R>, tile_gradient<R>, geometry_gradient<R>, ssim_values<R>, ssim_gradient<R>, network_values<R>, network_gradient<R>};
+    return {project<R>, draw_tile<R>, tile_gradient<R>, geometry_gradient<R>, ssim_values<R>, ssim_gradient<R>, network_values<R>, network_gradient<R>,
+            activate<R>, finish_colors<R>, move_children<R>};
 }
 extern const Kernels<float> single_precision;
 extern const Kernels<double> double_precision;

@@ -56,7 +56,7 @@ GRAINGS_INLINE int64_t whole_strips(int64_t rows) { return (rows + kStripRows - 
 template <class R>
 GRAINGS_INLINE void take_rows(const R* from, int64_t begin, int64_t rows, int64_t width, R* to, int64_t padded) {
     for (int64_t r = 0; r < rows; r++) {
-        std::memcpy(to + r * padded, from + (begin + r) * width, sizeof(R) * size_t(width));
+        if (width) std::memcpy(to + r * padded, from + (begin + r) * width, sizeof(R) * size_t(width));
         std::memset(to + r * padded + width, 0, sizeof(R) * size_t(padded - width));
     }
 }

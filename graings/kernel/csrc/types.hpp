@@ -183,6 +183,24 @@ struct NetworkArgs {
     R* hidden;            // the hidden levels of every block, kept for the gradient; may be null
 };
 
+constexpr int kMoving = 16;    // children per block of the arrays of MoveArgs
+constexpr int kOffsets = 10;   // outputs of DeformNet: position 3, rotation 4, log-scale 3
+enum Activation : int { kSigmoid, kTanh };
+
+// Children whose offsets in time are weights [width, kOffsets] times hidden units plus `bias`, in blocks of kMoving
+// children. A unit that is zero in a whole block is left out. Rows of `hidden` and `rest` hold a number for each child of
+// a block: those of block b are begin[b] to begin[b + 1], of the units `units`; in `rest` mean 3, quaternion 4, log-scale 3.
+template <class R>
+struct MoveArgs {
+    const R* hidden;  // [units of all blocks, kMoving]
+    const int64_t* begin;
+    const int32_t* units;
+    const R *rest, *weights, *bias;  // rest: [blocks, kOffsets, kMoving]
+    R extent, change, low, high;     // of the scene; bounds of log-scales
+    const int64_t* rows;             // children to move
+    R *mean, *quat, *log_scale;      // in the order of `rows`
+};
+
 // The functions compiled once per instruction set.
 template <class R>
 struct Kernels {
@@ -194,6 +212,9 @@ struct Kernels {
     void (*ssim_gradient)(const SsimArgs<R>&, int64_t begin, int64_t end, R* scratch);
     void (*network_values)(const NetworkArgs<R>&, int64_t begin, int64_t end, R* scratch);
     void (*network_gradient)(const NetworkArgs<R>&, int64_t begin, int64_t end, R* sums, R* scratch);
+    void (*activate)(Activation, int64_t count, const R* x, R* out);
+    void (*finish_colors)(int64_t count, R bound, const R* residual, R* colors);  // residual may be null
+    void (*move_children)(const MoveArgs<R>&, int64_t begin, int64_t end);
 };
 
 constexpr int kChunk = 64;  // entries of a tile prepared at a time in the forward pass

@@ -18,6 +18,7 @@ from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.render import render
+from graings.scene.prepared import PreparedScene
 from graings.scene.scene import Scene
 from graings.training.curriculum.time_window import TimeWindow
 from graings.training.initialization.visual_hull import MIN_VIEWS
@@ -62,9 +63,9 @@ def restart_window(config: TrainConfig, times: Sequence[float]) -> float | None:
 
 def missing_fraction(scene: Scene, frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> float:
     """Share of `frames` in which an object is missing from the render."""
-    missing = 0
+    missing, prepared = 0, PreparedScene(scene)
     for frame in frames:
-        render_ = render(scene, frame.camera, frame.time, background).color
+        render_ = render(prepared, frame.camera, frame.time, background).color
         missing += has_missing_object(render_, torch.from_numpy(images.rgb(frame)))
     return missing / len(frames)
 

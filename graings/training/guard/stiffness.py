@@ -24,7 +24,8 @@ from graings.gaussians import Gaussians
 from graings.render import draw, low_pass
 from graings.report.events import Stiff
 from graings.scene.children import quaternion_product
-from graings.scene.scene import Composition, Scene
+from graings.scene.prepared import PreparedScene
+from graings.scene.scene import Composed, Scene
 
 # Share of Gaussians whose step is no longer than `step_over_size` says.
 SHARE: Final = 0.99
@@ -93,7 +94,7 @@ class SubpixelCounter:
         self.views = 0
 
     @torch.no_grad()
-    def add(self, composition: Composition, radii: Float[Tensor, "gaussian 2"], camera: Camera) -> None:
+    def add(self, composition: Composed, radii: Float[Tensor, "gaussian 2"], camera: Camera) -> None:
         """Count one view that was drawn with `radii`."""
         gaussians = composition.gaussians
         visible = (radii.amax(1) > 0) & (gaussians.opacities > SEEN)
@@ -111,9 +112,9 @@ class SubpixelCounter:
 @torch.no_grad()
 def subpixel_share(scene: Scene, frames: Sequence[Frame], background: Sequence[float]) -> float | None:
     """f_sub over the views `frames`, each drawn once."""
-    counter = SubpixelCounter(scene)
+    counter, prepared = SubpixelCounter(scene), PreparedScene(scene)
     for frame in frames:
-        composition = scene.compose(frame.camera.center, frame.time)
+        composition = prepared.compose(frame.camera.center, frame.time)
         counter.add(composition, draw(composition, frame.camera, background).radii, frame.camera)
     return counter.share()
 

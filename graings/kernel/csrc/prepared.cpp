@@ -1,0 +1,164 @@
+#include "prepared.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+#include <optional>
+#include <stdexcept>
+#include <vector>
+
+#include "buffer.hpp"
+#include "encoding.hpp"
+#include "isa.hpp"
+#include "packed.hpp"
+#include "pool.hpp"
+
+namespace graings {
+namespace {
+
+constexpr int64_t kPiece = 4096;        // numbers per piece of work
+constexpr int64_t kPieceChildren = 1024;
+constexpr int64_t kPieceAnchors = 4 * kNetworkRows;
+
+template <class Body>
+void in_pieces(int threads, int64_t count, int64_t size, Body body) {
+    parallel_for(threads, (count + size - 1) / size, [&](int worker, int64_t piece) { body(worker, piece * size, std::min(count, (piece + 1) * size)); });
+}
+
+// A network with the inputs of a piece of anchors, each a group of its own, and buffers for each worker.
+template <class R>
+struct Head {
+    Packed<R> packed;
+    int64_t inputs, outputs;
+    Buffer<R> encoded, raw, scratch;
+    int64_t numbers[kPieceAnchors];
+
+    Head(const Network<R>& network, int threads)
+        : packed(network, nullptr, nullptr, false), inputs(network.widths[0]), outputs(network.widths.back()), encoded(size_t(threads * kPieceAnchors * inputs)),
+          raw(size_t(threads * kPieceAnchors * outputs)), scratch(size_t(threads * packed.scratch)) {
+        for (int64_t i = 0; i < kPieceAnchors; i++) numbers[i] = i;
+    }
+
+    // Outputs [last - first, outputs] from `input`.
+    void evaluate(int worker, int64_t first, int64_t last, const R* input, R* output) {
+        NetworkArgs<R> args = packed.args;
+        args.input = input, args.output = output;
+        args.shared += first * args.widths[1], args.groups = numbers;
+        kernels<R>().network_values(args, 0, last - first, scratch.get() + worker * packed.scratch);
+    }
+
+    // The same from encoded directions, in a buffer of the worker.
+    const R* seen(int worker, int64_t first, int64_t last, int degree, const R* directions, const R* normals) {
+        R *input = encoded.get() + worker * kPieceAnchors * inputs, *output = raw.get() + worker * kPieceAnchors * outputs;
+        encode_directions(last - first, degree, directions, normals ? normals + 3 * first : nullptr, input, 1);
+        evaluate(worker, first, last, input, output);
+        return output;
+    }
+};
+
+}  // namespace
+
+template <class R>
+void activate(Activation kind, int64_t count, const R* x, R* out, int threads) {
+    in_pieces(threads, count, kPiece, [&](int, int64_t begin, int64_t end) { kernels<R>().activate(kind, end - begin, x + begin, out + begin); });
+}
+
+template <class R>
+void directions(int64_t rows, const R* position, const double* eye, double nearest, R* out, int threads) {
+    const R at[3] = {R(eye[0]), R(eye[1]), R(eye[2])};
+    in_pieces(threads, rows, kPiece, [&](int, int64_t begin, int64_t end) {
+        for (int64_t row = begin; row < end; row++) {
+            const R *from = position + 3 * row, x = from[0] - at[0], y = from[1] - at[1], z = from[2] - at[2];
+            const R distance = std::max(std::sqrt(x * x + y * y + z * z), R(nearest));
+            out[3 * row] = x / distance, out[3 * row + 1] = y / distance, out[3 * row + 2] = z / distance;
+        }
+    });
+}
+
+template <class R>
+int64_t choose(const Shown<R>& in, int64_t slots, const Rendered<R>& out, int threads) {
+    const R bound = R(in.bound), threshold = R(in.threshold);
+    int64_t stride = 0;
+    if (in.change) {
+        Head<R> head(in.residual, threads);
+        stride = head.outputs * in.anchors / std::max<int64_t>(slots, 1);
+        in_pieces(threads, in.anchors, kPieceAnchors, [&](int worker, int64_t first, int64_t last) { head.evaluate(worker, first, last, nullptr, in.change + first * head.outputs); });
+    }
+    const int64_t pieces = (in.count + kPiece - 1) / kPiece;
+    Buffer<R> scores{size_t(in.count)};
+    std::vector<int64_t> before(size_t(pieces) + 1, 0);
+    in_pieces(threads, in.count, kPiece, [&](int, int64_t begin, int64_t end) {
+        R *score = scores.get() + begin, changes[kPiece];
+        for (int64_t r = begin; r < end; r++) {
+            const int64_t slot = in.slots[r];
+            if (slot < 0 || slot >= slots) throw std::invalid_argument("slots must have an opacity");
+            score[r - begin] = in.opacities[slot];
+            if (in.change) changes[r - begin] = in.change[slot * stride + stride - 1];
+        }
+        if (in.change) {
+            kernels<R>().activate(kTanh, end - begin, changes, changes);
+            for (int64_t i = 0; i < end - begin; i++) score[i] += bound * changes[i];
+        }
+        before[size_t(begin / kPiece) + 1] = std::count_if(score, score + (end - begin), [&](R x) { return x > threshold; });
+    });
+    std::partial_sum(before.begin(), before.end(), before.begin());
+    in_pieces(threads, in.count, kPiece, [&](int, int64_t begin, int64_t end) {
+        int64_t at = before[size_t(begin / kPiece)];
+        for (int64_t r = begin; r < end; r++) {
+            if (!(scores[size_t(r)] > threshold)) continue;
+            out.rows[at] = r, out.slots[at] = in.slots[r], out.children[at] = in.children[r], out.uids[at] = in.uids[r];
+            out.opacities[at++] = scores[size_t(r)];
+        }
+    });
+    return before.back();
+}
+
+template <class R>
+void move(const MoveArgs<R>& args, int64_t children, int64_t drawn, int threads) {
+    in_pieces(threads, drawn, kPieceChildren, [&](int, int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; i++)
+            if (args.rows[i] < 0 || args.rows[i] >= children) throw std::invalid_argument("rows must be children of this scene");
+        kernels<R>().move_children(args, begin, end);
+    });
+}
+
+template <class R>
+void paint(const ColorNetworks<R>& in, const double* eye, double nearest, int64_t drawn, const int64_t* children, R* colors, int threads) {
+    const int64_t slots = in.slots, row = 3 * slots;
+    for (int64_t i = 0; i < drawn; i++)
+        if (children[i] < (i ? children[i - 1] + 1 : 0) || children[i] >= in.anchors * slots)
+            throw std::invalid_argument("children must be slots of these anchors in ascending order");
+    Head<R> canonical(in.canonical, threads);
+    std::optional<Head<R>> residual;
+    if (in.residual_degree) residual.emplace(in.residual, threads);
+    Buffer<R> towards(size_t(threads * kPieceAnchors * 3)), changes(size_t(threads * kPieceAnchors * row));
+    in_pieces(threads, in.anchors, kPieceAnchors, [&](int worker, int64_t first, int64_t last) {
+        const int64_t* from = std::lower_bound(children, children + drawn, first * slots);
+        const int64_t* to = std::lower_bound(from, children + drawn, last * slots);
+        if (from == to) return;
+        R *direction = towards.get() + worker * kPieceAnchors * 3, *change = changes.get() + worker * kPieceAnchors * row;
+        directions(last - first, in.position + 3 * first, eye, nearest, direction, 1);
+        const R* raw = canonical.seen(worker, first, last, in.degree, direction, in.normals);
+        const R* seen = residual ? residual->seen(worker, first, last, in.residual_degree, direction, nullptr) : nullptr;
+        R* out = colors + 3 * (from - children);
+        for (const int64_t* child = from; child < to; child++) {
+            const int64_t at = *child - first * slots, i = 3 * (child - from);
+            std::copy_n(raw + 3 * at, 3, out + i);
+            if (seen) std::copy_n(seen + 3 * at, 3, change + i);
+            else if (in.time_only) std::copy_n(in.time_only + 4 * *child, 3, change + i);
+        }
+        kernels<R>().finish_colors(3 * (to - from), R(in.bound), seen || in.time_only ? change : nullptr, out);
+    });
+}
+
+#define GRAINGS_INSTANTIATE(R)                                                                   \
+    template void activate<R>(Activation, int64_t, const R*, R*, int);                           \
+    template void directions<R>(int64_t, const R*, const double*, double, R*, int);              \
+    template int64_t choose<R>(const Shown<R>&, int64_t, const Rendered<R>&, int);                        \
+    template void move<R>(const MoveArgs<R>&, int64_t, int64_t, int);                            \
+    template void paint<R>(const ColorNetworks<R>&, const double*, double, int64_t, const int64_t*, R*, int);
+GRAINGS_INSTANTIATE(float)
+GRAINGS_INSTANTIATE(double)
+#undef GRAINGS_INSTANTIATE
+
+}  // namespace graings

@@ -1,0 +1,132 @@
+"""The appearance of a prepared scene: scores of one time, colours of one view (Eq. 11 to 13)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from graings import constants, kernel
+from graings.scene.appearance import TemporalHead
+from graings.scene.encoding import direction_width
+from graings.scene.perceptron import GroupBias
+from graings.scene.scene import Scene
+
+
+class Candidates(NamedTuple):
+    """The children that some time and some view may show, in the order of the scene."""
+
+    slots: Int64[Tensor, " child"]  # among those of the kept anchors
+    children: Int64[Tensor, " child"]  # flat slots (anchor * k + child) of the scene
+    uids: Int64[Tensor, " child"]
+
+
+class Rendered(NamedTuple):
+    """The children that are rendered at one time, in the order of the scene."""
+
+    rows: Int64[Tensor, " gaussian"]  # among the candidates
+    slots: Int64[Tensor, " gaussian"]
+    children: Int64[Tensor, " gaussian"]
+    uids: Int64[Tensor, " gaussian"]
+    opacities: Float[Tensor, " gaussian"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Changes:
+    """The residual at one time, before its bound."""
+
+    time_only: Float[Tensor, "anchor value"]  # for each slot Delta o, after Delta c where that has no direction
+    biases: list[Tensor]  # of the head of Delta c that receives the direction; empty where there is none
+
+
+class _Head:
+    """A head of the residual without its part of the features, ready for the kernel."""
+
+    def __init__(self, head: TemporalHead, part: GroupBias, others: int) -> None:
+        self._head = head
+        self.hidden = part.values
+        self.weights = _contiguous(head.other_weights(others))
+
+    def biases(self, encoded_time: Tensor) -> list[Tensor]:
+        return _contiguous(self._head.biases(encoded_time))
+
+
+class PreparedAppearance:
+    """Opacities and colours of the children of `anchors` (indices) of `scene`, whose features are `features`."""
+
+    def __init__(
+        self, scene: Scene, anchors: Int64[Tensor, " anchor"], features: Float[Tensor, "anchor feature"]
+    ) -> None:
+        self._positions = scene.scaffold.anchors.index_select(0, anchors)
+        part = scene.appearance.color_part(features)
+        layers = map(_contiguous, scene.appearance.color_layers(part))
+        self._canonical = (part.normals, scene.appearance.color_sh_degree, part.hidden.values, *layers)
+        self._residual = scene.residual if scene.temporal else None
+        self._time_only: _Head | None = None
+        self._seeing: _Head | None = None
+        if self._residual is not None:
+            parts = self._residual.part(features)
+            self._time_only = _Head(self._residual, parts.time_only, 0)
+            if self._residual.seeing is not None and parts.seeing is not None:
+                others = direction_width(self._residual.sh_degree)
+                self._seeing = _Head(self._residual.seeing, parts.seeing, others)
+
+    def tensors(self) -> Iterable[Tensor]:
+        """What is kept in memory."""
+        heads = [head for head in (self._time_only, self._seeing) if head is not None]
+        canonical = [part for part in self._canonical if isinstance(part, Tensor)]
+        return (self._positions, *canonical, *(head.hidden for head in heads))
+
+    def rendered(
+        self, candidates: Candidates, opacities: Float[Tensor, "anchor child"], time: float
+    ) -> tuple[Rendered, Changes | None]:
+        """The candidates rendered at `time` in [0, 1] with canonical `opacities`, and the residual if any.
+
+        Scores are those of `Scene.compose` to the bit.
+        """
+        count = len(candidates.slots)
+        rows, slots, children, uids = candidates.slots.new_empty(4, count).unbind(0)
+        found = Rendered(rows, slots, children, uids, opacities.new_empty(count))
+        head: tuple[Any, ...] = (None, [], [], None, 0.0)
+        changes = None
+        if self._residual is not None and self._time_only is not None:
+            encoded_time = self._residual.encoded(self._positions.new_tensor([time]))
+            biases = self._time_only.biases(encoded_time)
+            changes = Changes(
+                self._positions.new_empty(len(self._positions), len(biases[-1])),
+                [] if self._seeing is None else self._seeing.biases(encoded_time),
+            )
+            head = (self._time_only.hidden, self._time_only.weights, biases, changes.time_only, self._residual.scale)
+        inputs = (*candidates, opacities, *head, constants.ALPHA_MIN)
+        count = kernel.kernel().choose(*inputs, *found, kernel.thread_count())
+        return Rendered._make(part[:count] for part in found), changes
+
+    def colors(
+        self, eye: ArrayLike, children: Int64[Tensor, " gaussian"], changes: Changes | None
+    ) -> Float[Tensor, "gaussian 3"]:
+        """Colours of `children` (ascending slots of these anchors) seen from `eye` [3] at the time of `changes`.
+
+        Equal to the bit to `CanonicalAppearance.colors`, the bounded residual and the clip of `Scene.compose`. Raises
+        `ValueError` for children out of order.
+        """
+        change: tuple[Any, ...] = (0, None, [], [], None, 0.0)
+        if changes is not None and self._residual is not None:
+            change = (0, None, [], [], changes.time_only, self._residual.scale)
+            if self._seeing is not None:
+                head = (self._seeing.hidden, self._seeing.weights, changes.biases)
+                change = (self._residual.sh_degree, *head, None, self._residual.scale)
+        colors = self._positions.new_empty(len(children), 3)
+        view = (np.asarray(eye, dtype=np.float64).ravel(), constants.NEAR)
+        inputs = (self._positions, *self._canonical, *change, *view, children)
+        kernel.kernel().paint(*inputs, colors, kernel.thread_count())
+        return colors
+
+
+def _contiguous(tensors: list[Tensor]) -> list[Tensor]:
+    """`tensors` as the kernel reads them."""
+    return [tensor.detach().contiguous() for tensor in tensors]
