@@ -173,8 +173,8 @@ class Store:
 
     def ids(self) -> list[str]:
         """All jobs, newest first, since ids begin with the time. Other files in their folder are ignored."""
-        names = [path.name for path in self._jobs.iterdir() if is_id(path.name) and path.is_dir()]
-        return sorted(names, reverse=True)
+        with os.scandir(self._jobs) as entries:
+            return sorted((entry.name for entry in entries if is_id(entry.name) and entry.is_dir()), reverse=True)
 
     def delete(self, job_id: str) -> None:
         """Remove a job, and its capture if no other job uses it. Raises `JobConflict` while its trainer runs."""
