@@ -53,7 +53,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(SameOrigin, allowed_hosts=settings.allowed_host_names)
     problems.install(app)
     # Added last, so that it comes first: a refused request costs next to nothing.
-    app.add_middleware(Admission, path="/render", limit=settings.render_slots + settings.render_waiting)
+    app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
     for routes in (jobs, results, render, system):
         app.include_router(routes.router)
     app.mount("/web", StaticFiles(directory=system.WEB), name="web")

@@ -60,7 +60,7 @@ def open_context(settings: Settings) -> Context:
         jobs=jobs,
         leases=open_leases(settings.database_url, store.workers),
         models=ModelCache(settings.models_mb * MB),
-        pool=RenderPool(settings.render_slots, settings.images_mb * MB),
+        pool=RenderPool(settings.images_at_once, settings.images_mb * MB),
     )
 
 

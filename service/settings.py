@@ -35,8 +35,8 @@ class Settings(BaseModel):
     min_free_mb: int = Field(512, ge=0, description="Free disk space, in MB, below which the service is not ready.")
     models_mb: int = Field(256, ge=1, description="Memory for models, in MB; at least one is kept.")
     images_mb: int = Field(32, ge=0, description="Memory for the last rendered images, in MB.")
-    render_slots: int = Field(
-        default_factory=usable_cores, ge=1, le=64, description="Images rendered at the same time (default: all cores)."
+    render_slots: int | None = Field(
+        None, ge=1, le=256, description="Images rendered at the same time; null: as many as there are cores."
     )
     render_waiting: int = Field(
         16, ge=0, le=1_000, description="Requests for images that may wait; further ones get 503."
@@ -47,6 +47,11 @@ class Settings(BaseModel):
     def database_url(self) -> str:
         """The URL of the database, which is in the data folder by default."""
         return self.database or default_database(self.data)
+
+    @property
+    def images_at_once(self) -> int:
+        """How many images are rendered at the same time."""
+        return self.render_slots or usable_cores()
 
     @property
     def allowed_host_names(self) -> frozenset[str]:
