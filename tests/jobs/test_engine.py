@@ -65,6 +65,7 @@ def test_jobs_run_by_priority_and_end_with_their_outcome(engine: Engine) -> None
     assert "unexpected" in (entries["broken"].error or "")
 
 
+@pytest.mark.slow(reason="waits for the polls of a queue")
 def test_a_job_can_be_cancelled_requeued_and_rewound_but_runs_under_its_own_limit(engine: Engine) -> None:
     running: list[str] = []
     most = 0

@@ -87,6 +87,7 @@ def is_idle(jobs: JobQueue, job_id: str) -> bool:
         return free
 
 
+@pytest.mark.slow(reason="two workers and two trainers, processes of their own")
 def test_another_worker_continues_the_job_of_a_killed_one_and_returns_it_to_the_queue_when_stopped(
     jobs: JobQueue,
 ) -> None:

@@ -71,6 +71,7 @@ def test_a_clip_with_large_motion_begins_with_a_part_of_it(large_motion: Path) -
     assert _found(large_motion, _draft(time_window=1.0)) == (60_000, 1.0)
 
 
+@pytest.mark.slow(reason="carves 240 000 points several times")
 def test_the_number_of_initial_anchors_is_limited(large_motion: Path) -> None:
     every, _ = _found(large_motion, _draft())
     assert _found(large_motion, _draft(**{"init.max_points": 50}))[0] == 50 < every
@@ -213,6 +214,7 @@ def test_a_small_component_without_points_lowers_the_coverage(accompanied: Path)
     assert coverage(_grid()[large | small], ends[:4] + middle, 50) < MIN_COVERAGE
 
 
+@pytest.mark.slow(reason="carves 240 000 points several times")
 def test_a_small_object_with_large_motion_shortens_the_window(accompanied: Path) -> None:
     for seed in range(3):
         data = load_capture(accompanied)
