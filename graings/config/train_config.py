@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
+from graings.config.plan_options import PlanConfig
 from graings.config.presets import PAPER_ITERATIONS, PRESETS
 from graings.config.sections import (
     CaptureConfig,
@@ -75,6 +76,7 @@ class TrainConfig(ConfigSection):
     rates: RatesConfig = RatesConfig()
     guard: GuardConfig = GuardConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+    plan: PlanConfig = PlanConfig()
 
     @model_validator(mode="before")
     @classmethod
