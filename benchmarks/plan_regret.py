@@ -151,11 +151,12 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=400)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--only", nargs="+", help="parts, as the table names them")
+    parser.add_argument("--scenes", nargs="+", help="scenes, as the table names them")
     options = parser.parse_args()
     calibration(1)
     lines = []
     for case in CASES:
-        if options.only and case.part not in options.only:
+        if case.part not in (options.only or [case.part]) or case.scene not in (options.scenes or [case.scene]):
             continue
         capture = capture_of(options.folder, case.scene, options.size, options.views)
         pairs, plan = [], None

@@ -14,7 +14,7 @@ from graings.kernel import use_threads
 from service import problems
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
-from service.routes import jobs, render, results, system
+from service.routes import jobs, plans, render, results, system
 from service.same_origin import SameOrigin
 from service.settings import Settings
 
@@ -34,7 +34,8 @@ def create_app(settings: Settings) -> FastAPI:
             await to_thread.run_sync(app.state.context.close)
 
     def limit(method: str, path: str) -> int:
-        return settings.max_upload_mb * MB if (method, path) == ("POST", "/jobs") else _SMALL_BODY
+        uploads = method == "POST" and path in ("/jobs", "/plans")
+        return settings.max_upload_mb * MB if uploads else _SMALL_BODY
 
     app = FastAPI(
         title="GrainGS",
@@ -45,7 +46,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(BodyLimit, limit=limit)
     app.add_middleware(SameOrigin, allowed_hosts=settings.allowed_host_names)
     problems.install(app)
-    for routes in (jobs, results, render, system):
+    for routes in (jobs, plans, results, render, system):
         app.include_router(routes.router)
     app.mount("/web", StaticFiles(directory=system.WEB), name="web")
     return app

@@ -109,7 +109,9 @@ def _reasons(decision: Decision) -> list[str]:
     """Why, with the number that decided; what it saves; and which option decides otherwise."""
     reasons = [decision.reason]
     condition = decision.condition
-    if condition is not None and condition.value is not None and decision.component in NUMBERED:
+    said = condition is None or condition.value is None or condition.name in decision.reason
+    single = condition is not None and condition.name.startswith("distinct")
+    if condition is not None and not said and not single and decision.component in NUMBERED:
         reasons[0] += f" ({condition})"
     saving = decision.saving
     if saving is not None and saving.predicted_s is not None and saving.predicted_share is not None:

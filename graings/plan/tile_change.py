@@ -49,8 +49,11 @@ def noise_sigma(images: Images) -> float:
     spatial = float(np.median([_spatial_sigma(image) for image in images]))
     if len(images) < 2:
         return spatial
-    steps = np.abs(np.diff(_fewer(images), axis=0))
-    return min(spatial, float(np.median(steps)) * MAD_TO_SIGMA / np.sqrt(2.0))
+    steps = np.diff(_fewer(images), axis=0)
+    # The median of a few whole grey levels is off by up to half a level: spread each evenly over its level.
+    spread = np.random.default_rng(0).uniform(-HALF_LEVEL, HALF_LEVEL, steps.shape)
+    median = float(np.median(np.abs(steps + spread)))
+    return min(spatial, float(np.sqrt(max(0.0, median**2 - HALF_LEVEL**2 / 4))) * MAD_TO_SIGMA / np.sqrt(2.0))
 
 
 def gains(images: Images, sigma: float) -> NDArray[np.float64]:

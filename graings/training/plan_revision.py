@@ -20,7 +20,7 @@ from graings.training.training_log import TrainingLog
 
 # Steps before and after a part is left out whose CPU time is compared.
 COMPARED_STEPS: Final = 50
-MIN_COMPARED_STEPS: Final = 20
+MIN_COMPARED_STEPS: Final = 10
 
 
 class PlanRevision:

@@ -42,7 +42,7 @@ from graings.training.trainer_state import TrainerState
 # Name that the guard gives to the gradients of the projected centres, which growth observes.
 SCREEN: Final = "screen"
 
-# A growth tells whether anchors are still needed where this share of the children was drawn often enough to qualify.
+# A growth tells whether anchors are still needed where this share of the drawn children was drawn often enough to grow.
 MIN_JUDGED_FRACTION: Final = 0.5
 
 
@@ -160,8 +160,7 @@ class Trainer(TrainerState):
         """Grow and prune anchors where the schedule says so; returns the events."""
         events: list[Event] = []
         if self.density.grows(self.iteration) and not self.growth_ended:
-            observed = self.density.statistics.drawn > self.config.density.min_observations
-            judged = float(observed.double().mean()) >= MIN_JUDGED_FRACTION and self._sees_everything()
+            judged = self._can_judge_growth()
             grown, events = self.density.grow(self.run_iteration, self.scene, self.optimizer, self.streams["growth"])
             if grown > 0:
                 self.guard.trend.grown()
@@ -171,9 +170,13 @@ class Trainer(TrainerState):
             events += self.density.prune(self.run_iteration, self.scene, self.optimizer)
         return events
 
-    def _sees_everything(self) -> bool:
-        """Whether all times are trained on at full resolution: growth may begin again when they come."""
-        return self.window.share(self.iteration) >= 1 and self.pyramid.at(self.iteration).factor == 1
+    def _can_judge_growth(self) -> bool:
+        """Whether most children were drawn often enough to grow, at all times of the clip and full resolution."""
+        if self.window.share(self.iteration) < 1 or self.pyramid.at(self.iteration).factor > 1:
+            return False  # growth may begin again when they come
+        drawn = self.density.statistics.drawn
+        often = int((drawn > self.config.density.min_observations).sum())
+        return often > 0 and often >= MIN_JUDGED_FRACTION * int((drawn > 0).sum())
 
     def _note_quiet(self, wanted: bool) -> list[Event]:
         """Count growths in a row that added no anchor; `wanted` says whether any qualified."""
