@@ -19,7 +19,7 @@ from graings.plan.survey import survey
 from graings.training.calibration import calibration
 
 # Parts whose condition says more than the reason does.
-NUMBERED = ("deformation", "residual", "alpha_loss", "preset")
+NUMBERED = ("deformation", "residual", "preset")
 COLORS = {"drop": "green", "propose": "yellow", "later": "cyan", "keep": "default"}
 
 

@@ -55,9 +55,9 @@ class Condition(Document):
         unit = f" {self.unit}" if self.unit else ""
         if self.value is None:
             return f"{self.name} not measurable"
-        sign = (
-            self.op.replace("==", "=") if self.holds else {"==": "≠", "<=": ">", "<": "≥", ">=": "<", ">": "≤"}[self.op]
-        )
+        signs: dict[Operator, str] = {"==": "=", "<=": "≤", "<": "<", ">=": "≥", ">": ">"}
+        opposites: dict[Operator, str] = {"==": "≠", "<=": ">", "<": "≥", ">=": "<", ">": "≤"}
+        sign = (signs if self.holds else opposites)[self.op]
         return f"{self.name} {self.value:.4g} {sign} {self.threshold:.4g}{unit}"
 
 

@@ -186,10 +186,10 @@ def _alpha_loss(statistics: CaptureStatistics, config: TrainConfig) -> Decision:
         return _dropped("alpha_loss", "exact", NO_ALPHA, None)
     if statistics.alpha == "opaque" and looked.holds:
         return _dropped("alpha_loss", "exact", "the alpha channel is 1 everywhere in all images", looked)
-    reason = "the masks show what is opaque"
     if statistics.alpha == "opaque":
-        reason = "alpha is 1 in the images looked at, and not all were"
-    return Decision(component="alpha_loss", decision="keep", kind="exact", reason=reason, condition=looked)
+        reason = f"alpha is 1 in the images looked at, but these were {looked.value:g} of {looked.threshold:g}"
+        return Decision(component="alpha_loss", decision="keep", kind="exact", reason=reason, condition=looked)
+    return Decision(component="alpha_loss", decision="keep", kind="exact", reason="the masks show what is opaque")
 
 
 def _given(component: Component, unneeded: bool, name: str, value: int, op: str) -> Decision:

@@ -77,9 +77,12 @@ class PlanRevision:
         trainer.drop_residual()
         return (PartDropped(iteration=iteration, component="residual", bound=bound),)
 
-    def finish(self, iterations: int) -> None:
-        """After all `iterations`: the prediction's error, and what leaving the residual out saved."""
-        plan = self.plan
+    def finish(self, iterations: int, view_loss: float | None) -> None:
+        """After all `iterations`: the prediction's error, what leaving the residual out saved, and view dependence.
+
+        `view_loss` is that of `graings.training.view_dependence`, in dB.
+        """
+        plan = _with_view_loss(self.plan, view_loss)
         if plan.prediction is not None:
             # A restart repeats steps that no statistic of the capture foresees: it counts as part of the error.
             prediction = plan.prediction.compared(self.log.clock.train_cpu_s)
@@ -124,3 +127,16 @@ class PlanRevision:
             "reason": f"no anchor was added from there on in {event.growths} growths",
         }
         self.log.plan = self.plan.revised(decision.model_copy(update=update))
+
+
+def _with_view_loss(plan: Plan, loss: float | None) -> Plan:
+    """The plan with the measured view dependence; where there is none, the next training may do without."""
+    decision = plan.decision("view_dependence")
+    if loss is None or decision is None or decision.condition is None:
+        return plan
+    condition = decision.condition.model_copy(update={"value": loss})
+    update: dict[str, object] = {"condition": condition}
+    if condition.holds:
+        reason = "the trained model hardly uses the viewing direction: another training may do without"
+        update |= {"decision": "propose", "reason": reason}
+    return plan.revised(decision.model_copy(update=update))

@@ -258,7 +258,7 @@ class TrainingRun:
         self.log.note(events)
         self._save(finished=True)
         compact = self.output.export(trainer)
-        self.revision.finish(self.iteration)
+        self.revision.finish(self.iteration, self.output.view_dependence(trainer))
         self.output.write_metrics(trainer, self.iteration, self.iterations, splits, compact, stiffness)
         return point, events
 

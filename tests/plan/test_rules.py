@@ -147,7 +147,7 @@ def test_off_leaves_nothing_out() -> None:
     [
         ({"times": 1}, {"plan.keep": ["deformation"]}, "distinct training times 1 = 1"),
         ({"times": 1}, {"plan.keep": ["residual"]}, "distinct training times 1 = 1"),
-        ({}, {"plan.keep": ["deformation"]}, "1 <= 1"),
+        ({}, {"plan.keep": ["deformation"]}, "1 ≤ 1"),
         ({"change": STILL.model_copy(update={"ratio": 310.0})}, {"scene.deformation": "none"}, "310 > 1"),
         ({"alpha": "absent"}, {"plan.keep": ["alpha_loss"]}, "alpha is absent"),
     ],

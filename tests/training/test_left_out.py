@@ -23,6 +23,7 @@ from graings.storage.checkpoint import load_model
 from graings.training.residual_bound import residual_bound
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
+from graings.training.view_dependence import view_dependence
 from tests.capture.captures import entry, orbit, write_image, write_transforms
 from tests.plan.fixed_cameras import texture, write_fixed
 from tests.training.micro import GROWING, micro_config, micro_trainer, steps
@@ -226,6 +227,36 @@ def test_a_single_time_trains_with_everything_kept(tmp_path: Path) -> None:
     run = TrainingRun.create(folder, tmp_path / "run", micro_config(iterations=30, **{"plan.mode": "off"}))
     assert {report.phase for report in run} == {"warmup", "joint"}
     assert load_model(tmp_path / "run").scene.deformation is not None
+
+
+def test_colours_that_ignore_the_view_lose_nothing_with_those_of_another(capture: Path) -> None:
+    trainer = micro_trainer(capture, **{"scene.reflection": False, "scene.residual_sh_degree": 0})
+    steps(trainer, 40)
+    color = trainer.scene.appearance.color[0]
+    assert isinstance(color, torch.nn.Linear)
+    frames, losses = trainer.capture.train[:2], []
+    for weight in (0.0, 0.5):
+        with torch.no_grad():
+            color.weight[:, 8:] = weight  # the inputs after the feature are the direction's
+        others = trainer.capture.train[2:]
+        losses.append(view_dependence(trainer.scene, frames, others, trainer.images, trainer.background))
+    assert losses[0] == 0.0
+    assert losses[1] is not None
+    assert abs(losses[1]) > 1e-3
+    assert view_dependence(trainer.scene, (), frames, trainer.images, trainer.background) is None
+
+
+@pytest.mark.parametrize(("loss", "decision"), [(0.05, "propose"), (0.051, "keep"), (None, "keep")])
+def test_a_model_that_hardly_uses_the_view_proposes_to_train_without(
+    capture: Path, tmp_path: Path, loss: float | None, decision: str
+) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", micro_config(iterations=2))
+    run.revision.finish(2, loss)
+    plan = read_plan(tmp_path / "run")
+    assert plan is not None
+    found = plan.decision("view_dependence")
+    assert found is not None
+    assert found.decision == decision
 
 
 def test_the_plan_of_a_run_is_that_of_its_statistics(capture: Path, tmp_path: Path) -> None:
