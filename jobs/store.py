@@ -23,7 +23,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from graings.storage.files import sync_folder, sync_tree, write_json
-from graings.storage.run_folder import MODEL_FILE, newest_checkpoint
+from graings.storage.run_folder import MODEL_FILE, PLAN_FILE, newest_checkpoint
 from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
 from jobs.locks import locked
 
@@ -59,6 +59,10 @@ class JobFolder:
     @property
     def metrics(self) -> Path:
         return self.run / "metrics.json"
+
+    @property
+    def plan(self) -> Path:
+        return self.run / PLAN_FILE
 
     @property
     def curve(self) -> Path:

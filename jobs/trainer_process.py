@@ -25,6 +25,7 @@ from graings.config import TrainConfig, restored
 from graings.errors import DivergedError, GraingsError
 from graings.report.events import Diverged
 from graings.report.folder import report_runs
+from graings.training.calibration import calibration
 from graings.training.run import TrainingRun
 from graings.training.run_output import RunReport
 from jobs.exit_code import ExitCode
@@ -89,6 +90,7 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     progress.write(
         ProgressReport(phase="loading", iteration=checkpoint or 0, iterations=config.iterations, attempt=attempt)
     )
+    calibration(threads)  # the first job on a machine measures it; plans predict with it from then on
     if checkpoint is None:
         shutil.rmtree(folder.run, ignore_errors=True)  # the incomplete run of an attempt without a checkpoint
         run = TrainingRun.create(capture, folder.run, config.model_copy(update={"threads": threads}))

@@ -1,4 +1,4 @@
-"""Inspection: check that training can start on an unpacked capture.
+"""Inspection: check that training can start on an unpacked capture, and plan it.
 
 Third-party libraries decode uploaded images and COLMAP models. They run in a separate process, so that a crash or lack
 of memory there does not end the service.
@@ -6,22 +6,39 @@ of memory there does not end the service.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from anyio import BrokenWorkerProcess, to_process
 
 from graings.capture.load import load_capture
-from graings.config import CaptureConfig
+from graings.config import CaptureConfig, TrainConfig
 from graings.errors import CaptureError
+from graings.plan.cost import stored_calibration
+from graings.plan.plan import Plan
+from graings.plan.survey import survey
 from jobs.store import capture_root
 
 _Defect = tuple[str, str, str | None, str]  # problem, file, field, remedy
+Options = TypeVar("Options", CaptureConfig, TrainConfig)
 
 
 async def inspect_capture(folder: Path, config: CaptureConfig) -> None:
     """Raise `CaptureError` if training cannot start on the unpacked capture; it names files by their path in it."""
+    await _apart(_find_defect, folder, config)
+
+
+async def plan_capture(folder: Path, config: TrainConfig) -> Plan:
+    """The plan of training with `config` on the unpacked capture. Raises `CaptureError` as `inspect_capture` does."""
+    planned = await _apart(_make_plan, folder, config)
+    return Plan.model_validate_json(planned)
+
+
+async def _apart(look: Callable[[Path, Options], _Defect | str | None], folder: Path, options: Options) -> str:
+    """What `look` finds in another process. Raises `CaptureError` for a defect."""
     try:
-        defect = await to_process.run_sync(_find_defect, folder, config, cancellable=True)
+        found = await to_process.run_sync(look, folder, options, cancellable=True)
     except BrokenWorkerProcess as error:
         raise CaptureError(
             "reading it ended the reading process",
@@ -29,19 +46,34 @@ async def inspect_capture(folder: Path, config: CaptureConfig) -> None:
             remedy="Open its images, and its COLMAP model if it has one, in the programs that wrote them, and save"
             " again the files that cannot be read.",
         ) from error
-    if defect is not None:
-        problem, file, field, remedy = defect
+    if isinstance(found, tuple):
+        problem, file, field, remedy = found
         raise CaptureError(problem, file=file, field=field, remedy=remedy)
+    return found or ""
 
 
 def _find_defect(folder: Path, config: CaptureConfig) -> _Defect | None:
     root = capture_root(folder)
+    try:
+        load_capture(root, config)
+    except CaptureError as error:
+        return _defect(root, error)
+    return None
+
+
+def _make_plan(folder: Path, config: TrainConfig) -> _Defect | str:
+    """The plan as JSON. The service measures no times itself: it uses the calibration of an earlier training."""
+    root = capture_root(folder)
+    try:
+        return survey(root, config, stored_calibration()).model_dump_json(by_alias=True)
+    except CaptureError as error:
+        return _defect(root, error)
+
+
+def _defect(root: Path, error: CaptureError) -> _Defect:
+    """The error as a tuple, because pickle cannot restore its keyword arguments; files by their path in the archive."""
 
     def relative(text: str) -> str:
         return text.replace(f"{root}/", "").replace(str(root), "the archive")
 
-    try:
-        load_capture(root, config)
-    except CaptureError as error:  # as a tuple: pickle cannot restore its keyword arguments
-        return relative(error.problem), relative(error.file), error.field, relative(error.remedy)
-    return None
+    return relative(error.problem), relative(error.file), error.field, relative(error.remedy)

@@ -85,6 +85,8 @@ def job_summary(job: Job) -> JobSummary:
         links["retry"] = f"{base}/retry"
     if job.checkpoint is not None or job.has_model:
         links["render"] = f"/render?job={job.id}"
+    if job.has_plan:
+        links["plan"] = f"{base}/plan"
     if job.has_metrics:
         links |= {"metrics": f"{base}/metrics", "curve": f"{base}/curve.svg", "report": f"{base}/report"}
     if job.has_model:

@@ -25,6 +25,29 @@ from service.problems import BadRequest
 
 _CHUNK = 1 << 20
 
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_FORM = {
+    "type": "object",
+    "required": ["capture"],
+    "properties": {
+        "capture": {"type": "string", "format": "binary", "description": "A zip, tar or tar.gz of the capture."},
+        "config": {"type": "string", "description": "Options as a JSON object, which override those of the query."},
+    },
+}
+# How the routes that receive a capture describe their body.
+CAPTURE_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "The capture: transforms_*.json, transforms.json or COLMAP, packed as zip, tar or tar.gz.",
+        "content": {
+            "application/zip": _BINARY,
+            "application/x-tar": _BINARY,
+            "application/gzip": _BINARY,
+            "multipart/form-data": {"schema": _FORM},
+        },
+    }
+}
+
 
 @dataclass(frozen=True, slots=True)
 class Upload:

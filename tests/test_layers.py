@@ -59,7 +59,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
-        *("graings.kernel", "graings.render", "graings.report", "graings.storage", "graings.training"),
+        *("graings.kernel", "graings.plan", "graings.render", "graings.report", "graings.storage"),
+        "graings.training",
     ),
     # Durable work knows the method by its options and files; one child process trains.
     "jobs": (
@@ -69,8 +70,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
     # HTTP never trains.
     "service": (
-        *("graings.camera", "graings.capture", "graings.config", "graings.kernel", "graings.render", "graings.report"),
-        *("graings.storage", "jobs"),
+        *("graings.camera", "graings.capture", "graings.config", "graings.kernel", "graings.plan", "graings.render"),
+        *("graings.report", "graings.storage", "jobs"),
     ),
 }
 
@@ -82,11 +83,12 @@ HOMES: dict[str, tuple[str, ...]] = {
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
     "typer": (
-        *("graings.cli.main", "graings.cli.option_table", "graings.cli.synthesize", "graings.cli.training"),
-        *("jobs.commands", "service.commands", "service.demo"),
+        *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.synthesize"),
+        *("graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
     ),
     "rich": (
-        *("graings.cli.main", "graings.cli.option_table", "graings.cli.progress", "graings.cli.synthesize"),
+        *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.progress"),
+        "graings.cli.synthesize",
         *("graings.cli.terminal", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
     ),
     "OpenImageIO": ("graings.capture", "graings.image_encoding"),

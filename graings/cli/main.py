@@ -23,6 +23,7 @@ from rich.text import Text
 from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.camera.viewpoint import background_rgb
 from graings.cli.option_table import show_options
+from graings.cli.planning import plan
 from graings.cli.synthesize import synthesize
 from graings.cli.terminal import metrics_line, motion_line, print_line
 from graings.cli.training import MultiValueCommand, Threads, ablate, train
@@ -89,6 +90,7 @@ def graings() -> None:
 
 
 app.command()(train)
+app.command()(plan)
 app.command()(synthesize)
 app.command(cls=MultiValueCommand)(ablate)
 app.command(name="options")(show_options)

@@ -55,9 +55,9 @@ def train(
     else:
         if capture is None:
             raise typer.BadParameter("name the folder of the capture to train on", param_hint="CAPTURE")
-        overrides = dict(_setting(text) for text in settings or ())
+        overrides = dict(setting(text) for text in settings or ())
         if preset is not None:
-            _check_one_preset(preset, overrides)
+            check_one_preset(preset, overrides)
             overrides["preset"] = preset
         if threads is not None:
             overrides["threads"] = threads
@@ -96,9 +96,9 @@ def ablate(
 
     Run the same command again to continue; rows and seeds can be added later.
     """
-    overrides = dict(_setting(text) for text in settings or ())
+    overrides = dict(setting(text) for text in settings or ())
     if preset is not None:
-        _check_one_preset(preset, overrides)
+        check_one_preset(preset, overrides)
     named = str(overrides.pop("preset", "standard"))
     ablation = Ablation(
         *(output, capture),
@@ -131,7 +131,7 @@ def ablate(
     print_line(f"The table is in {output / 'ablation.md'}, with ablation.json and ablation.svg beside it.")
 
 
-def _check_one_preset(preset: str, overrides: dict[str, Any]) -> None:
+def check_one_preset(preset: str, overrides: dict[str, Any]) -> None:
     if overrides.get("preset", preset) != preset:
         raise typer.BadParameter(f"the preset is {preset} and {overrides['preset']}; give one of --preset and --set")
 
@@ -157,7 +157,7 @@ def _print_result(run: TrainingRun) -> None:
         print_line(metrics_line(split, metrics))
 
 
-def _setting(text: str) -> tuple[str, Any]:
+def setting(text: str) -> tuple[str, Any]:
     """Key and value of `key=value`, the value as JSON if it is valid JSON, else as a string."""
     key, equals, value = text.partition("=")
     if not equals or not key:

@@ -7,6 +7,8 @@ from graings.config.optimization import RatesConfig as RatesConfig
 from graings.config.overrides import make_config as make_config
 from graings.config.overrides import options as options
 from graings.config.overrides import restored as restored
+from graings.config.plan_options import Part as Part
+from graings.config.plan_options import PlanConfig as PlanConfig
 from graings.config.presets import PAPER_ITERATIONS as PAPER_ITERATIONS
 from graings.config.presets import PRESETS as PRESETS
 from graings.config.sections import CaptureConfig as CaptureConfig

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from graings.config.optimization import DensityConfig, EvaluationConfig, GuardConfig, RatesConfig
+from graings.config.plan_options import PlanConfig
 from graings.config.presets import PAPER_ITERATIONS, PRESETS
 from graings.config.sections import CaptureConfig, ConfigSection, InitConfig, LossConfig, SceneConfig
 
@@ -66,6 +67,7 @@ class TrainConfig(ConfigSection):
     rates: RatesConfig = RatesConfig()
     guard: GuardConfig = GuardConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+    plan: PlanConfig = PlanConfig()
 
     @model_validator(mode="before")
     @classmethod

@@ -1,33 +1,25 @@
-"""Plan: which components this scene does not need, each with its reason.
+"""Plan: which parts this capture does not need, each with its evidence, and what the training will cost.
 
-A component is left out only where it could not have changed the images that the model can produce.
+Decisions of the classes exact, representable and bounded are carried out. Estimated ones are proposed, and carried out
+with `plan.mode=aggressive` only.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from pydantic import Field
 
-from graings.capture.capture import Capture
 from graings.config import TrainConfig
 from graings.document import Document
+from graings.plan.capture_statistics import CaptureStatistics
+from graings.plan.cost import Calibration, Prediction, predict
+from graings.plan.decision import Component, Decision, Saving
+from graings.plan.rules import contradictions, decide
 
-NO_ALPHA = "the images have no alpha channel"
-
-Component = Literal["deformation", "residual", "temporal_loss", "rigidity", "alpha_loss", "random_points", "carving"]
-
-
-class Decision(Document):
-    """One component and what becomes of it."""
-
-    component: Component = Field(description="Part of the model, the loss or the initialisation.")
-    decision: Literal["keep", "drop"] = Field(description="Whether the component is used.")
-    kind: Literal["exact", "representable", "user"] = Field(
-        description="Why dropping it is safe. exact: it would compute the same; representable: the other components "
-        "can represent its effect; user: an option asks for it."
-    )
-    reason: str = Field(description="The reason in plain words.")
+# Parts of which leaving them out saves time that the calibration knows.
+_COSTLY: tuple[Component, ...] = ("deformation", "residual")
 
 
 class Plan(Document):
@@ -36,71 +28,80 @@ class Plan(Document):
     schema_name: Literal["graings.plan/1"] = Field(
         "graings.plan/1", alias="schema", description="Kind and version of this document."
     )
+    mode: Literal["safe", "aggressive", "off"] = Field("safe", description="`plan.mode` of the options.")
     decisions: tuple[Decision, ...] = Field(description="One decision per component.")
+    warnings: tuple[str, ...] = Field(
+        (), description="What the capture does not show, and options that contradict a measurement, in plain words."
+    )
+    statistics: CaptureStatistics | None = Field(None, description="What was measured of the capture.")
+    prediction: Prediction | None = Field(
+        None, description="Expected cost of the training; null without a calibration of this machine."
+    )
+    alternatives: dict[str, Prediction] = Field(
+        default_factory=dict, description="Expected cost with other presets, without other options."
+    )
 
     def drops(self, component: Component) -> bool:
         """Whether `component` is left out."""
         return any(d.component == component and d.decision == "drop" for d in self.decisions)
 
+    def decision(self, component: Component) -> Decision | None:
+        """The decision about `component`; None where the plan has none."""
+        return next((d for d in self.decisions if d.component == component), None)
+
+    def revised(self, decision: Decision) -> Plan:
+        """With another decision about the same component."""
+        others = [decision if d.component == decision.component else d for d in self.decisions]
+        return self.model_copy(update={"decisions": tuple(others)})
+
     def apply(self, config: TrainConfig) -> TrainConfig:
         """The configuration without what the plan leaves out."""
-        scene: dict[str, object] = {}
-        loss: dict[str, object] = {}
-        if self.drops("deformation"):
-            scene["deformation"] = "none"
-        if self.drops("residual"):
-            scene["residual"] = False
-        if self.drops("temporal_loss"):
-            loss["temporal"] = 0.0
-        if self.drops("rigidity"):
-            loss["rigidity"] = 0.0
-        if self.drops("alpha_loss"):
-            loss["alpha"] = 0.0
-        return config.model_copy(
-            update={"scene": config.scene.model_copy(update=scene), "loss": config.loss.model_copy(update=loss)}
-        )
+        return without(config, [d.component for d in self.decisions if d.decision == "drop" and d.iteration is None])
 
 
-def make_plan(capture: Capture, config: TrainConfig) -> Plan:
-    """Decide what to leave out for `capture`."""
-    decisions: list[Decision] = []
+def without(config: TrainConfig, components: Sequence[Component]) -> TrainConfig:
+    """`config` without some components. Those that no option switches are left as they are."""
+    scene: dict[str, object] = {}
+    loss: dict[str, object] = {}
+    if "deformation" in components:
+        scene["deformation"] = "none"
+    if "residual" in components:
+        scene["residual"] = False
+    for component, weight in (("temporal_loss", "temporal"), ("rigidity", "rigidity"), ("alpha_loss", "alpha")):
+        if component in components:
+            loss[weight] = 0.0
+    return config.model_copy(
+        update={"scene": config.scene.model_copy(update=scene), "loss": config.loss.model_copy(update=loss)}
+    )
 
-    def decide(
-        component: Component, drop: bool, reason: str, kind: Literal["exact", "representable"] = "representable"
-    ) -> None:
-        decisions.append(Decision(component=component, decision="drop" if drop else "keep", kind=kind, reason=reason))
 
-    def dropped_by_user(component: Component, reason: str) -> None:
-        decisions.append(Decision(component=component, decision="drop", kind="user", reason=reason))
+def make_plan(
+    statistics: CaptureStatistics,
+    config: TrainConfig,
+    calibration: Calibration | None = None,
+    alternatives: Sequence[TrainConfig] = (),
+) -> Plan:
+    """Decide what to leave out of training with `config`, and predict the cost of it and of `alternatives`."""
+    decisions = tuple(_with_saving(d, statistics, config, calibration) for d in decide(statistics, config))
+    plan = Plan(mode=config.plan.mode, decisions=decisions, statistics=statistics)
+    warnings = contradictions(statistics, config)
+    if calibration is None:
+        return plan.model_copy(update={"warnings": warnings})
+    costs = {
+        one.preset: predict(statistics, make_plan(statistics, one).apply(one), calibration) for one in alternatives
+    }
+    prediction = predict(statistics, plan.apply(config), calibration)
+    return plan.model_copy(update={"warnings": warnings, "prediction": prediction, "alternatives": costs})
 
-    instants = len(capture.times)
-    single = instants == 1
-    count = "1 distinct training time" if single else f"{instants} distinct training times"
-    if config.scene.deformation == "none":
-        dropped_by_user("deformation", "scene.deformation is none")
-    else:
-        reason = "the canonical state is the only state" if single else "objects may move"
-        decide("deformation", single, f"{count}: {reason}")
-    if not config.scene.residual:
-        dropped_by_user("residual", "scene.residual is off")
-    else:
-        reason = "the canonical colour can be any colour" if single else "the light may change"
-        decide("residual", single, f"{count}: {reason}")
-    static = single or config.scene.deformation == "none"
-    decide("temporal_loss", static, "no pair of times" if static else count, "exact")
-    one_view = config.batch == 1 or len(capture.train) == 1
-    if config.loss.rigidity == 0:
-        dropped_by_user("rigidity", "loss.rigidity is 0")
-    else:
-        reason = "nothing moves" if static else "one view per step" if one_view else "neighbours move together"
-        decide("rigidity", static or one_view, reason, "exact")
-    if config.loss.alpha == 0:
-        dropped_by_user("alpha_loss", "loss.alpha is 0")
-    else:
-        reason = "the masks show what is opaque" if capture.has_alpha else NO_ALPHA
-        decide("alpha_loss", not capture.has_alpha, reason, "exact")
-    cloud = capture.points is not None
-    decide("random_points", cloud, "the capture has a point cloud" if cloud else "the capture has no point cloud")
-    empty = "the masks show empty space" if capture.has_alpha else "background pixels show empty space"
-    decide("carving", cloud, "no random points" if cloud else empty, "exact")
-    return Plan(decisions=tuple(decisions))
+
+def _with_saving(
+    decision: Decision, statistics: CaptureStatistics, config: TrainConfig, calibration: Calibration | None
+) -> Decision:
+    """The decision with what leaving the part out saves against training with all costly parts."""
+    if calibration is None or decision.component not in _COSTLY or decision.kind == "user":
+        return decision
+    whole = predict(statistics, config, calibration).cpu_s
+    rest = predict(statistics, without(config, [decision.component]), calibration).cpu_s
+    saved = max(0.0, whole - rest)
+    saving = Saving(predicted_s=saved, predicted_share=min(1.0, saved / max(whole, 1e-9)))
+    return decision.model_copy(update={"saving": saving})

@@ -146,6 +146,31 @@ class Thinned(_Event):
         )
 
 
+class GrowthQuiet(_Event):
+    """Several growths in a row added no anchor."""
+
+    kind: Literal["growth_quiet"] = Field("growth_quiet", description=KIND)
+    growths: int = Field(gt=0, description="How many growths in a row added none.")
+    ended: bool = Field(description="Whether growth and its statistics end; plan.mode=aggressive ends them.")
+
+    def _words(self) -> str:
+        then = "growth ends" if self.ended else "plan.mode=aggressive would end growth here"
+        return f"{self.growths} growths in a row added no anchor: {then}"
+
+
+class PartDropped(_Event):
+    """Training measured that a part of the model does not show, and leaves it out from here on."""
+
+    kind: Literal["part_dropped"] = Field("part_dropped", description=KIND)
+    component: str = Field(description="The part, as the plan names it.")
+    bound: float = Field(ge=0, description="Greatest change of a pixel of a training view, values in [0, 1].")
+
+    def _words(self) -> str:
+        return (
+            f"the {self.component} is left out: it changes no training view by more than {255 * self.bound:.2g} levels"
+        )
+
+
 class GradientsClipped(_Event):
     """The gradients of one group of parameters were far above their usual norm and were scaled down."""
 
@@ -250,6 +275,8 @@ Event = Annotated[
     | GrowthCapped
     | Pruned
     | Thinned
+    | GrowthQuiet
+    | PartDropped
     | GradientsClipped
     | StepSkipped
     | RolledBack

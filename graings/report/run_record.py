@@ -12,7 +12,7 @@ from graings.document import Document, read_document
 from graings.errors import CheckpointError
 from graings.plan.plan import Plan
 from graings.report.machine import VersionFacts
-from graings.storage.run_folder import RECORD_FILE
+from graings.storage.run_folder import PLAN_FILE, RECORD_FILE
 
 
 class CaptureSource(Document):
@@ -32,7 +32,7 @@ class RunRecord(Document):
     )
     capture: CaptureSource = Field(description="The capture.")
     config: TrainConfig = Field(description="All options of the run.")
-    plan: Plan = Field(description="Components that this scene does not need.")
+    plan: Plan = Field(description="Components that this scene does not need, as planned at the start.")
     versions: VersionFacts = Field(description="Versions at the start of the run.")
 
 
@@ -45,3 +45,11 @@ def read_record(run: Path) -> RunRecord:
             "of one of its checkpoints."
         )
     return read_document(file, RunRecord, "Use the version that wrote it, or train again.")
+
+
+def read_plan(run: Path) -> Plan | None:
+    """The plan of a run folder with what training decided; None in a folder without one. Raises `CheckpointError`."""
+    file = run / PLAN_FILE
+    if not file.exists():
+        return None  # the run was interrupted before it wrote one
+    return read_document(file, Plan, "Remove it; the plan of the start is in run.json.")

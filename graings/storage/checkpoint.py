@@ -12,7 +12,8 @@ import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -183,3 +184,14 @@ def _read_facts(folder: Path) -> dict[str, Any]:
 
 def _contiguous(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor.detach().contiguous().clone() for name, tensor in tensors.items()}
+
+
+@contextmanager
+def intact(checkpoint: Path) -> Iterator[None]:
+    """Raise `CheckpointError` about `checkpoint` where its contents do not fit."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{checkpoint}: damaged training state ({error!r}). Remove it to continue from an earlier one."
+        ) from error

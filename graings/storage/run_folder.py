@@ -13,6 +13,7 @@ from pathlib import Path
 from graings.errors import CheckpointError
 
 RECORD_FILE = "run.json"
+PLAN_FILE = "plan.json"
 LOCK_FILE = ".training"
 CHECKPOINTS = "checkpoints"
 MODEL_FILE = "model.graings"  # the compact model

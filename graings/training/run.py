@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
@@ -20,14 +19,24 @@ from graings.config import TrainConfig
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation.evaluate import subset
 from graings.kernel import computing_threads
+from graings.plan.capture_statistics import measure
+from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan, make_plan
 from graings.report.events import Diverged, Event, Restarted
 from graings.report.metrics_document import METRICS_FILE, EvaluationPoint, read_metrics
-from graings.report.run_record import read_record
-from graings.storage.checkpoint import best_checkpoint, load_model, load_state, load_training, newest_checkpoint
+from graings.report.run_record import read_plan, read_record
+from graings.storage.checkpoint import (
+    best_checkpoint,
+    intact,
+    load_model,
+    load_state,
+    load_training,
+    newest_checkpoint,
+)
 from graings.storage.run_folder import RECORD_FILE, sole_trainer
 from graings.training.curriculum import missing_motion
 from graings.training.curriculum.restart import RestartState
+from graings.training.plan_revision import PlanRevision
 from graings.training.run_output import RunOutput, RunReport, psnr_of_best
 from graings.training.timing import Clock, Rate, evaluation_marks
 from graings.training.trainer import Trainer
@@ -41,17 +50,26 @@ class TrainingRun:
     of the process are as before afterwards.
     """
 
-    def __init__(self, folder: Path, capture: Capture, config: TrainConfig, threads: int | None, clock: Clock) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        capture: Capture,
+        config: TrainConfig,
+        threads: int | None,
+        clock: Clock,
+        plan: Plan | None = None,
+    ) -> None:
         self.folder = folder
         self.capture = capture
         self.config = config
         self.threads = threads if threads is not None else config.threads
-        self.plan: Plan = make_plan(capture, config)
         started, computed = time.perf_counter(), time.process_time()
         seen = with_background(config.capture, capture)
-        self.applied = self.plan.apply(config).model_copy(update={"capture": seen})
         self.images = ImageStore(seen.background_rgb(), seen.cache_mb)
-        self.log = TrainingLog(folder, capture, config, self.plan, clock)
+        plan = plan or make_plan(measure(capture, self.images, seen.background_rgb()), config, stored_calibration())
+        self.applied = plan.apply(config).model_copy(update={"capture": seen})
+        self.log = TrainingLog(folder, capture, config, plan, clock)
+        self.revision = PlanRevision(self.log)
         self.output = RunOutput(folder, self.images, self.log)
         self._best_psnr: float | None = None
         clock.add("init", time.perf_counter() - started, time.process_time() - computed)
@@ -72,6 +90,7 @@ class TrainingRun:
         run._start(RestartState())
         folder.mkdir(parents=True, exist_ok=True)
         run.log.write_run()
+        run.revision.write()
         return run
 
     @classmethod
@@ -89,12 +108,12 @@ class TrainingRun:
         if data.content_hash != record.capture.hash:
             raise CheckpointError(f"{data.root}: not the capture this run began with. Give the original one.")
         clock.add("load", time.perf_counter() - started)
-        run = cls(folder, data, config, threads, clock)
+        run = cls(folder, data, config, threads, clock, read_plan(folder) or record.plan)
         if newest_checkpoint(folder) is None:
             run._start(RestartState())
             return run
         model, state = load_training(folder)
-        with _intact(model.path), computing_threads(run.threads):
+        with intact(model.path), computing_threads(run.threads):
             run._restart = RestartState(**state.facts["restart"])
             run._trainer = Trainer.resume(
                 data,
@@ -153,12 +172,14 @@ class TrainingRun:
             self.log.gaussians = step.gaussians
             rate.add(step.seconds)
             self.log.note(step.events)
+            self.revision.note(step)
             last = step.iteration == self.iterations
             saving = step.iteration % self.config.evaluation.checkpoint_every == 0
             evaluating = step.iteration in evaluation_marks(self.config, self.iterations)
             # A scene with a NaN is never evaluated or saved.
             events: tuple[Event, ...] = self._check() if last or saving or evaluating else ()
             point = self._evaluate() if evaluating and not last else None
+            events += self.revision.revise(self._trainer, self.iteration) if evaluating and not last else ()
             events += self._restart_if_motion_is_missing()
             if saving and not last:
                 self._save()
@@ -237,6 +258,7 @@ class TrainingRun:
         self.log.note(events)
         self._save(finished=True)
         compact = self.output.export(trainer)
+        self.revision.finish(self.iteration, self.output.view_dependence(trainer))
         self.output.write_metrics(trainer, self.iteration, self.iterations, splits, compact, stiffness)
         return point, events
 
@@ -269,14 +291,3 @@ class TrainingRun:
             return False
         document = read_metrics(self.metrics_path)
         return document.iterations == self.iterations and bool(document.splits or not self.capture.val)
-
-
-@contextmanager
-def _intact(checkpoint: Path) -> Iterator[None]:
-    """Raise `CheckpointError` about `checkpoint` where its contents do not fit."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{checkpoint}: damaged training state ({error!r}). Remove it to continue from an earlier one."
-        ) from error

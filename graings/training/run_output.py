@@ -25,6 +25,7 @@ from graings.training.held_out import HeldOut
 from graings.training.step_report import StepReport
 from graings.training.trainer import Trainer
 from graings.training.training_log import TrainingLog
+from graings.training.view_dependence import view_dependence
 
 LOG = logging.getLogger(__name__)
 
@@ -104,6 +105,14 @@ class RunOutput:
         share = subpixel_share(trainer.scene, frames, trainer.background)
         self.log.clock.add("evaluation", time.perf_counter() - started)
         return Stiffness(trainer.step_over_size, share, len(frames))
+
+    def view_dependence(self, trainer: Trainer) -> float | None:
+        """Loss of PSNR of the held-out views with the colours of other views, in dB; None without any."""
+        started = time.perf_counter()
+        others = self.log.capture.train
+        loss = view_dependence(trainer.scene, self.held_out(), others, self.images, trainer.background)
+        self.log.clock.add("evaluation", time.perf_counter() - started)
+        return loss
 
     def psnr(self, trainer: Trainer, frames: Sequence[Frame]) -> float | None:
         """Mean PSNR of the scene as it is over `frames`, in dB."""

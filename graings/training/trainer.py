@@ -18,11 +18,14 @@ from torch import Tensor
 from graings.camera.sampling_rate import SamplingRate
 from graings.capture.capture import Frame
 from graings.errors import DivergedError
+from graings.plan.rules import QUIET_GROWTHS
 from graings.render import draw, low_pass
 from graings.report.events import (
     BackgroundFound,
     Event,
     GradientsClipped,
+    GrowthCapped,
+    GrowthQuiet,
     LowResolutionStarted,
     OpacityReset,
     RolledBack,
@@ -38,6 +41,9 @@ from graings.training.trainer_state import TrainerState
 
 # Name that the guard gives to the gradients of the projected centres, which growth observes.
 SCREEN: Final = "screen"
+
+# A growth tells whether anchors are still needed where this share of the drawn children was drawn often enough to grow.
+MIN_JUDGED_FRACTION: Final = 0.5
 
 
 class Trainer(TrainerState):
@@ -84,7 +90,7 @@ class Trainer(TrainerState):
         if check.non_finite is None:
             events += self._limit_gradients(check, frames)
             # A step far above the usual size gives no evidence of where anchors are needed.
-            if self.density.watches(self.iteration) and not check.limits:
+            if self.watches() and not check.limits:
                 self.density.observe(frames, compositions, results, offsets)
             self.optimizer.step(self.iteration)
             self._measure_step(compositions[0], frames[0])
@@ -153,13 +159,32 @@ class Trainer(TrainerState):
     def _adapt(self) -> list[Event]:
         """Grow and prune anchors where the schedule says so; returns the events."""
         events: list[Event] = []
-        if self.density.grows(self.iteration):
+        if self.density.grows(self.iteration) and not self.growth_ended:
+            judged = self._can_judge_growth()
             grown, events = self.density.grow(self.run_iteration, self.scene, self.optimizer, self.streams["growth"])
             if grown > 0:
                 self.guard.trend.grown()
+            if judged:
+                events += self._note_quiet(grown > 0 or any(isinstance(event, GrowthCapped) for event in events))
         if self.density.prunes(self.iteration):
             events += self.density.prune(self.run_iteration, self.scene, self.optimizer)
         return events
+
+    def _can_judge_growth(self) -> bool:
+        """Whether most children were drawn often enough to grow, at all times of the clip and full resolution."""
+        if self.window.share(self.iteration) < 1 or self.pyramid.at(self.iteration).factor > 1:
+            return False  # growth may begin again when they come
+        drawn = self.density.statistics.drawn
+        often = int((drawn > self.config.density.min_observations).sum())
+        return often > 0 and often >= MIN_JUDGED_FRACTION * int((drawn > 0).sum())
+
+    def _note_quiet(self, wanted: bool) -> list[Event]:
+        """Count growths in a row that added no anchor; `wanted` says whether any qualified."""
+        self.quiet_growths = 0 if wanted else self.quiet_growths + 1
+        if self.quiet_growths != QUIET_GROWTHS or "growth" in self.config.plan.keep:
+            return []
+        self.growth_ended = self.config.plan.mode == "aggressive"
+        return [GrowthQuiet(iteration=self.run_iteration, growths=self.quiet_growths, ended=self.growth_ended)]
 
     def _average(self) -> None:
         """Average the parameters of the last steps, in which no anchor is added or removed, and end with the mean."""

@@ -124,6 +124,8 @@ class TrainerState:
         self.guard = Guard(self.config.guard)
         self.collapse = Collapse()
         self.average = ParameterAverage()
+        self.quiet_growths = 0  # growths in a row that added no anchor
+        self.growth_ended = False
         self.step_over_size: float | None = None  # of the last step that was measured and not rolled back
         self._restart_views()
 
@@ -142,6 +144,21 @@ class TrainerState:
     def phase(self, iteration: int) -> Phase:
         """The phase that `iteration` (from 1) belongs to."""
         return next(phase for phase in self.phases if iteration <= phase.last)
+
+    def watches(self) -> bool:
+        """Whether this iteration is observed for the next growth or pruning."""
+        growing = self.iteration <= self.config.scaled(self.config.density.grow_until)
+        return self.density.watches(self.iteration) and not (growing and self.growth_ended)
+
+    def drop_residual(self) -> None:
+        """Go on without the residual field. Everything else keeps its values, moments and random numbers."""
+        state, joint_from = self.optimizer.state(), self.phases[-1].first - 1
+        self.scene.residual = None
+        self.scene.config = self.scene.config.model_copy(update={"residual": False})
+        views, damping = min(self.config.batch, len(self.capture.train)), self.optimizer.damping
+        self.optimizer = Optimizer(self.scene, self.config, joint_from=joint_from, views=views)
+        self.optimizer.damping = damping
+        self.optimizer.load({name: value for name, value in state.items() if not name.startswith("residual.")})
 
     def _slow_down(self) -> None:
         self.optimizer.damping = RATE_CUT**self.guard.rollbacks
@@ -170,6 +187,8 @@ class TrainerState:
             "collapse": self.collapse.state(),
             "average": average,
             "step_over_size": self.step_over_size,
+            "quiet_growths": self.quiet_growths,
+            "growth_ended": self.growth_ended,
         }
         return tensors, facts
 
@@ -184,6 +203,8 @@ class TrainerState:
         self.collapse.load(facts["collapse"])
         self.average.load(parts["average"], facts["average"])
         self.step_over_size = facts["step_over_size"]
+        self.quiet_growths = facts["quiet_growths"]
+        self.growth_ended = facts["growth_ended"]
         self._slow_down()
         self._restart_views()
         self.views.sampler.remaining = parts["sampler"]["remaining"].clone()

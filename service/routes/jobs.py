@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 from urllib.parse import urlencode
 
 from anyio import to_thread
@@ -14,35 +14,14 @@ from service.context import ContextDep, JobId
 from service.inspection import inspect_capture
 from service.problems import RESPONSES
 from service.schemas import JobPage, JobResource, job_resource, job_summary
-from service.uploads import parse_config, receive_capture
+from service.uploads import CAPTURE_BODY, parse_config, receive_capture
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], responses=RESPONSES)
 
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
-_FORM = {
-    "type": "object",
-    "required": ["capture"],
-    "properties": {
-        "capture": {"type": "string", "format": "binary", "description": "A zip, tar or tar.gz of the capture."},
-        "config": {"type": "string", "description": "Options as a JSON object, which override those of the query."},
-    },
-}
-_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "description": "The capture: transforms_*.json, transforms.json or COLMAP, packed as zip, tar or tar.gz.",
-        "content": {
-            "application/zip": _BINARY,
-            "application/x-tar": _BINARY,
-            "application/gzip": _BINARY,
-            "multipart/form-data": {"schema": _FORM},
-        },
-    }
-}
 RETRY_AFTER_S = "2"
 
 
-@router.post("", status_code=202, operation_id="submit_job", openapi_extra=_BODY)
+@router.post("", status_code=202, operation_id="submit_job", openapi_extra=CAPTURE_BODY)
 async def submit(
     request: Request,
     response: Response,

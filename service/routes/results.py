@@ -1,4 +1,4 @@
-"""Routes of the results of a job: metrics, curve, report, model and log; its progress as a stream of events."""
+"""Routes of the results of a job: plan, metrics, curve, report, model and log; its progress as a stream of events."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import FileResponse, PlainTextResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from graings.plan.plan import Plan
 from graings.report.metrics_document import Metrics
 from graings.report.work_precision_document import REPORT_FILE, WorkPrecision
 from jobs.job import Job, JobNotFound, JobState
@@ -52,6 +53,13 @@ EVENT_STREAM: dict[str, Any] = {
 def metrics(job_id: JobId, here: ContextDep) -> Response:
     """The metrics document, schema `graings.metrics/1`; it is rewritten after every evaluation."""
     path = _existing(here.store.folder(job_id).metrics, "metrics", "They come with the first evaluation.")
+    return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
+
+
+@router.get("/plan", operation_id="get_plan", response_model=Plan)
+def plan(job_id: JobId, here: ContextDep) -> Response:
+    """The plan of the training, schema `graings.plan/1`; training adds what it decides and what it measured."""
+    path = _existing(here.store.folder(job_id).plan, "plan", "It comes when training begins; POST /plans makes one.")
     return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
 
 

@@ -32,6 +32,8 @@ EVENTS: tuple[Event, ...] = (
     events.GrowthCapped(iteration=200, anchors=90, max_anchors=100),
     events.Pruned(iteration=200, anchors=2),
     events.Thinned(iteration=200, anchors_before=100, anchors_after=50),
+    events.GrowthQuiet(iteration=200, growths=5, ended=True),
+    events.PartDropped(iteration=400, component="residual", bound=0.001),
     events.GradientsClipped(iteration=201, group="color", norm=1e10, limit=2.5, views=("a", "b")),
     StepSkipped(iteration=202, non_finite="the loss", views=("a",), times=(0.25,)),
     events.RolledBack(iteration=203, to_iteration=150, reason="the loss was not finite", rate_factor=0.5),

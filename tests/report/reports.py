@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from graings.plan.decision import Decision
+from graings.plan.plan import Plan
 from graings.report.machine import machine_facts, version_facts
 from graings.report.metrics_document import EvaluationPoint, Metrics
 from graings.report.work_precision import training_part
@@ -63,10 +65,9 @@ def values(*curve: EvaluationPoint, **changes: Any) -> dict[str, Any]:
         "render_fps": 20.0,
         "curve": [evaluation.to_json() for evaluation in curve],
         "events": [{"iteration": 200, "kind": "grew", "anchors": 3, "message": "grew 3 anchors"}],
-        "plan": {
-            "schema": "graings.plan/1",
-            "decisions": [{"component": "rigidity", "decision": "drop", "kind": "user", "reason": "weight 0"}],
-        },
+        "plan": Plan(
+            decisions=(Decision(component="rigidity", decision="drop", kind="user", reason="weight 0"),)
+        ).to_json(),
         "capture": {
             "frames": {"train": 8, "val": 2, "test": 2},
             "times": 8,

@@ -12,6 +12,7 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import make_config
 from graings.evaluation.evaluate import evaluate
+from graings.plan.capture_statistics import measure
 from graings.plan.plan import make_plan
 from graings.render import render
 from graings.training import losses
@@ -78,6 +79,6 @@ def test_a_capture_without_alpha_has_no_alpha_loss(tmp_path: Path) -> None:
     config = make_config("draft")
     for alpha, decision in ((True, "keep"), (False, "drop")):
         capture = load_capture(snowman(tmp_path / f"{alpha}", alpha=alpha), config.capture)
-        plan = make_plan(capture, config)
+        plan = make_plan(measure(capture, ImageStore((1.0, 1.0, 1.0)), (1.0, 1.0, 1.0)), config)
         assert [d.decision for d in plan.decisions if d.component == "alpha_loss"] == [decision]
         assert plan.apply(config).loss.alpha == (config.loss.alpha if alpha else 0.0)

@@ -1,0 +1,182 @@
+"""What leaving a part out costs in quality, and what it saves: every automatic drop of the plan, with and without.
+
+    python benchmarks/plan_regret.py FOLDER [--size 100] [--views 60] [--iterations 400] [--only PART ...]
+
+Writes the captures it needs and the runs into FOLDER, leaves out what is finished, and prints a Markdown table: mean
+PSNR of the validation views with and without the part, the 95 % interval of the paired difference (Student's t over the
+seeds), CPU seconds of training, bytes of the model in float32, predicted and measured saving. The same seed is paired,
+and named random streams keep the numbers of what stays. One thread, preset draft.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+from graings.capture.image_file import decode
+from graings.capture.synthetic import synthesize
+from graings.config import make_config
+from graings.plan.plan import Plan
+from graings.report.metrics_document import Metrics, read_metrics
+from graings.report.run_record import read_plan
+from graings.training.calibration import calibration
+from graings.training.run import TrainingRun
+
+T_95 = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571}  # two-sided, by degrees of freedom
+NOISE = 0.01
+HEAD = (
+    "| part | scene | decision | PSNR with | without | difference, 95 % | CPU s with | without | kB with | without | "
+    "predicted saving | measured |"
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A part, the capture on which its condition holds, and the options with which it is kept and left out."""
+
+    part: str
+    scene: str
+    kept: dict[str, Any]
+    left_out: dict[str, Any]
+
+
+EAGER = {"plan.mode": "aggressive"}
+CASES = (
+    Case("deformation", "still", {"plan.keep": ["deformation"]}, {}),
+    Case("residual", "still", {"plan.keep": ["residual"]}, {}),
+    Case("deformation", "resting", {"plan.keep": ["deformation"], **EAGER}, EAGER),
+    Case("residual", "resting", {"plan.keep": ["residual"], **EAGER}, EAGER),
+    Case("growth", "still", {"plan.keep": ["growth"], **EAGER}, EAGER),
+    Case("residual, later", "walker", {"plan.keep": ["residual"]}, {}),
+    Case("view dependence of the residual", "walker", {"scene.residual_sh_degree": 2}, {"scene.residual_sh_degree": 0}),
+)
+
+
+def resting(folder: Path, size: int, views: int) -> Path:
+    """The scene `rig` at rest: each fixed camera sees its first image at all times, each time with other noise."""
+    synthesize("rig", folder, size=size, views=views)
+    random = np.random.default_rng(0)
+    for listed in folder.glob("transforms_*.json"):
+        first: dict[str, Path] = {}
+        for frame in json.loads(listed.read_text())["frames"]:
+            path = folder / f"{frame['file_path']}.png"
+            source = first.setdefault(json.dumps(frame["transform_matrix"]), path)
+            if not (original := source.with_suffix(".first")).exists():
+                shutil.copy(source, original)
+            write_noisy(decode_copy(original), path, random)
+        for original in first.values():
+            original.with_suffix(".first").unlink(missing_ok=True)
+    return folder
+
+
+def decode_copy(file: Path) -> np.ndarray:
+    """Pixels [H, W, 4] of a PNG under another suffix, colour multiplied by alpha."""
+    image = shutil.copy(file, file.with_suffix(".copy.png"))
+    try:
+        return decode(Path(image), file.name)
+    finally:
+        Path(image).unlink()
+
+
+def write_noisy(pixels: np.ndarray, path: Path, random: np.random.Generator) -> None:
+    """Composite on white, add noise and write 8 bits, opaque."""
+    rgb = pixels[..., :3] + (1 - pixels[..., 3:]) if pixels.shape[-1] == 4 else pixels
+    noisy = np.clip(rgb + random.normal(0, NOISE, rgb.shape), 0, 1)
+    output = oiio.ImageOutput.create(str(path))
+    output.open(str(path), oiio.ImageSpec(rgb.shape[1], rgb.shape[0], 3, "uint8"))
+    output.write_image(np.rint(255 * noisy).astype(np.uint8))
+    output.close()
+
+
+def capture_of(folder: Path, scene: str, size: int, views: int) -> Path:
+    """The capture, written where it is missing."""
+    place = folder / "captures" / scene
+    if not (place / "transforms_train.json").exists():
+        shutil.rmtree(place, ignore_errors=True)
+        make: Callable[[Path], Path] = (
+            (lambda path: resting(path, size, views))
+            if scene == "resting"
+            else (lambda path: synthesize(scene, path, size=size, views=views))
+        )
+        make(place)
+    return place
+
+
+def trained(run: Path, capture: Path, options: dict[str, Any]) -> tuple[Metrics, Plan]:
+    """Metrics and plan of a run, which is trained where it is not finished."""
+    config = make_config("draft", options)
+    if not (run / "model.graings").exists():
+        shutil.rmtree(run, ignore_errors=True)
+        for _ in TrainingRun.create(capture, run, config):
+            pass
+        print(f"{run}: {read_metrics(run / 'metrics.json').train_cpu_s:.0f} CPU s", flush=True)
+    plan = read_plan(run)
+    assert plan is not None
+    return read_metrics(run / "metrics.json"), plan
+
+
+def row(case: Case, pairs: list[tuple[Metrics, Metrics]], plan: Plan) -> str:
+    """One line of the table; `pairs` are with and without the part, `plan` is that of a run without it."""
+    psnr = [[float(m.splits["val"].psnr or 0.0) for m in pair] for pair in pairs]
+    differences = [without - with_ for with_, without in psnr]
+    mean = statistics.mean(differences)
+    half = T_95[len(pairs) - 1] * statistics.stdev(differences) / len(pairs) ** 0.5 if len(pairs) > 1 else float("nan")
+    cpu = [statistics.mean(pair[side].train_cpu_s for pair in pairs) for side in (0, 1)]
+    size = [statistics.mean(pair[side].bytes.fp32 for pair in pairs) / 1e3 for side in (0, 1)]
+    decision = next((d for d in plan.decisions if d.component == case.part.split(",")[0]), None)
+    saving = None if decision is None else decision.saving
+    predicted = "" if saving is None or saving.predicted_s is None else f"{saving.predicted_s:.0f} s"
+    happened = "" if decision is None else f"{decision.kind}, {decision.decision}"
+    return (
+        f"| {case.part} | {case.scene} | {happened} | {statistics.mean(p[0] for p in psnr):.2f} | "
+        f"{statistics.mean(p[1] for p in psnr):.2f} | {mean:+.2f} [{mean - half:+.2f}, {mean + half:+.2f}] | "
+        f"{cpu[0]:.0f} | {cpu[1]:.0f} | {size[0]:.0f} | {size[1]:.0f} | {predicted} | {cpu[0] - cpu[1]:.0f} s |"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--size", type=int, default=100)
+    parser.add_argument("--views", type=int, default=60)
+    parser.add_argument("--iterations", type=int, default=400)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--only", nargs="+", help="parts, as the table names them")
+    parser.add_argument("--scenes", nargs="+", help="scenes, as the table names them")
+    options = parser.parse_args()
+    calibration(1)
+    lines = []
+    for case in CASES:
+        if case.part not in (options.only or [case.part]) or case.scene not in (options.scenes or [case.scene]):
+            continue
+        capture = capture_of(options.folder, case.scene, options.size, options.views)
+        pairs, plan = [], None
+        for seed in options.seeds:
+            pair = []
+            for side in (case.kept, case.left_out):
+                # The same options give the same run, which several cases share.
+                key = "-".join(f"{k}={v}" for k, v in sorted(side.items())) or "default"
+                run = options.folder / "runs" / case.scene / "".join(c if c.isalnum() else "_" for c in key) / str(seed)
+                common = {"iterations": options.iterations, "threads": 1, "seed": seed, "time_window": 1.0}
+                metrics, plan = trained(run, capture, {**common, **side})
+                pair.append(metrics)
+            pairs.append((pair[0], pair[1]))
+        assert plan is not None
+        lines.append(row(case, pairs, plan))
+        print(lines[-1], flush=True)
+    print(HEAD)
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Calibration: how long steps of a tiny synthetic scene take on this machine, measured once and kept."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+import graings
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.capture.synthetic import write_synthetic
+from graings.config import RatesConfig, TrainConfig, make_config
+from graings.kernel import computing_threads
+from graings.plan.cost import (
+    CALIBRATION_FILE,
+    TERMS,
+    Calibration,
+    Load,
+    cache_folder,
+    stored_calibration,
+    visible_pixels,
+)
+from graings.report.machine import machine_facts
+from graings.storage.files import write_document
+from graings.training.trainer import Trainer
+
+WARM_STEPS: Final = 2
+TIMED_STEPS: Final = 5
+SIZES: Final = (64, 224)
+RATE: Final = 1e-12
+
+# Size in px, first anchors, views a step, deformation, residual.
+CASES: Final = (
+    *((64, 100, 4, True, True), (64, 1_200, 4, True, True), (224, 100, 4, True, True), (224, 1_200, 4, True, True)),
+    *((64, 1_200, 4, False, True), (64, 1_200, 4, True, False), (64, 1_200, 4, False, False)),
+    *((64, 1_200, 1, True, True), (224, 100, 1, True, True), (64, 1_200, 1, False, False)),
+)
+
+
+def calibration(threads: int | None = None, folder: Path | None = None) -> Calibration:
+    """The calibration of this machine for `threads` CPU threads (None: all cores), from `folder` or measured now.
+
+    It is kept in `folder` (None: the user's cache folder) and measured again for another version of graings, processor
+    or number of threads.
+    """
+    place = folder or cache_folder()
+    with computing_threads(threads) as count:
+        kept = stored_calibration(place)
+        same = (graings.__version__, machine_facts().cpu, count)
+        if kept is not None and (kept.version, kept.cpu, kept.threads) == same:
+            return kept
+        measured = measure_calibration(count)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        write_document(place / CALIBRATION_FILE, measured)
+    except OSError:
+        pass  # a home without a writable cache: it is measured again next time
+    return measured
+
+
+def measure_calibration(threads: int) -> Calibration:
+    """Time steps of several sizes and fit the times of their parts."""
+    started = time.process_time()
+    rows, cpu, wall = [], [], []
+    with tempfile.TemporaryDirectory(prefix="graings-") as temporary:
+        captures = {size: write_synthetic(Path(temporary) / str(size), frames=8, size=size) for size in SIZES}
+        for size, anchors, views, deformation, residual in CASES:
+            load, cpu_s, wall_s = _timed(captures[size], _config(anchors, views, deformation, residual))
+            rows.append(load.terms())
+            cpu.append(cpu_s)
+            wall.append(wall_s)
+    seconds = np.array(cpu)
+    times = _non_negative(np.array(rows), seconds)
+    relative = np.array(rows) @ times / seconds - 1.0
+    return Calibration(
+        version=graings.__version__,
+        cpu=machine_facts().cpu,
+        threads=threads,
+        **dict(zip(TERMS, times.tolist(), strict=True)),
+        # Other processes only lengthen the wall-clock time; one thread alone takes as long as its CPU time.
+        wall_over_cpu=min(1.0, float(np.min(np.array(wall) / seconds))),
+        error=float(np.sqrt(np.mean(np.square(relative)))),
+        cost_s=time.process_time() - started,
+    )
+
+
+def _config(anchors: int, views: int, deformation: bool, residual: bool) -> TrainConfig:
+    return make_config(
+        "standard",
+        {
+            "iterations": 30_000,
+            "warmup": 0,
+            "batch": views,
+            "time_window": 1.0,
+            "init.points": 50 * anchors,
+            "init.max_points": anchors,
+            "scene.deformation": "child" if deformation else "none",
+            "scene.residual": residual,
+            "density.statistics_from": 0,
+            # All children stay drawn, as nearly all of a trained scene are: the first steps would make them fade.
+            "rates": dict.fromkeys(RatesConfig.model_fields, (RATE, RATE)),
+        },
+    )
+
+
+def _timed(capture: Path, config: TrainConfig) -> tuple[Load, float, float]:
+    """The load of a step, and its median CPU and wall-clock seconds."""
+    data = load_capture(capture, config.capture)
+    images = ImageStore(config.capture.background_rgb())
+    trainer = Trainer.start(data, images, config)
+    steps = [trainer.step() for _ in range(WARM_STEPS + TIMED_STEPS)][WARM_STEPS:]
+    camera = data.train[0].camera
+    coverage = float(np.mean([(images.rgb(frame).min(-1) < 0.99).mean() for frame in data.train]))
+    load = Load(
+        views=config.batch,
+        pixels=visible_pixels(camera.width * camera.height, coverage),
+        gaussians=float(np.median([step.gaussians for step in steps])),
+        deformation=config.scene.deformation != "none",
+        residual=config.scene.residual,
+    )
+    return load, float(np.median([s.cpu_s for s in steps])), float(np.median([s.seconds for s in steps]))
+
+
+def _non_negative(rows: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least squares of relative errors with no negative time: columns that come out negative are left out in turn."""
+    times = np.zeros(rows.shape[1])
+    scaled, columns = rows / seconds[:, None], list(range(rows.shape[1]))
+    while columns:
+        solution = np.linalg.lstsq(scaled[:, columns], np.ones(len(seconds)), rcond=None)[0]
+        if (solution >= 0).all():
+            times[columns] = solution
+            break
+        columns.pop(int(solution.argmin()))
+    return times

@@ -1,0 +1,142 @@
+"""PlanRevision: what training adds to the plan of its run: parts found unneeded, savings measured, the cost it had."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import deque
+from typing import Final
+
+from graings.plan.decision import Decision, Saving
+from graings.plan.plan import Plan
+from graings.plan.tile_change import HALF_LEVEL
+from graings.report.events import Event, GrowthQuiet, PartDropped
+from graings.storage.files import write_document
+from graings.storage.run_folder import PLAN_FILE
+from graings.training.residual_bound import residual_bound
+from graings.training.step_report import StepReport
+from graings.training.trainer import Trainer
+from graings.training.training_log import TrainingLog
+
+# Steps before and after a part is left out whose CPU time is compared.
+COMPARED_STEPS: Final = 50
+MIN_COMPARED_STEPS: Final = 10
+
+
+class PlanRevision:
+    """The plan in the `log` of a run, revised while it trains.
+
+    A residual is left out once two evaluations in a row find that it changes no training view by half a grey level.
+    """
+
+    def __init__(self, log: TrainingLog) -> None:
+        self.log = log
+        self._below = 0  # evaluations in a row that found the residual's bound below the limit
+        self._recent: deque[float] = deque(maxlen=COMPARED_STEPS)  # CPU seconds of the last joint steps
+        self._before: float | None = None  # CPU seconds of a step before the residual was left out
+
+    def note(self, step: StepReport) -> None:
+        """Take in what a step did and cost."""
+        if step.phase == "joint":
+            self._recent.append(step.cpu_s)
+        for event in step.events:
+            if isinstance(event, GrowthQuiet):
+                self._note_growth(event)
+
+    @property
+    def plan(self) -> Plan:
+        """The plan as it is now."""
+        return self.log.plan
+
+    def revise(self, trainer: Trainer, iteration: int) -> tuple[Event, ...]:
+        """After an evaluation: leave the residual out if it does nothing. Returns what happened."""
+        started = time.perf_counter()
+        events = self._judge_residual(trainer, iteration)
+        self.log.note(events)
+        if events:
+            self.write()
+        self.log.clock.add("evaluation", time.perf_counter() - started)
+        return events
+
+    def _judge_residual(self, trainer: Trainer, iteration: int) -> tuple[Event, ...]:
+        decision = self.plan.decision("residual")
+        if decision is None or decision.kind != "bounded" or trainer.scene.residual is None:
+            return ()
+        if trainer.iteration < (decision.iteration or 0):
+            return ()  # it begins at zero, and the warm-up does not train it
+        if trainer.iteration > trainer.config.scaled(trainer.config.average_from):
+            return ()  # the trained model is the mean of these steps, in which no part may change
+        bound = residual_bound(trainer.scene, trainer.capture.train, trainer.background, HALF_LEVEL)
+        self._below = self._below + 1 if bound <= HALF_LEVEL else 0
+        drop = self._below >= 2
+        self._record(decision, bound, iteration if drop else None)
+        if not drop:
+            return ()
+        self._before = statistics.median(self._recent) if len(self._recent) >= MIN_COMPARED_STEPS else None
+        self._recent.clear()
+        trainer.drop_residual()
+        return (PartDropped(iteration=iteration, component="residual", bound=bound),)
+
+    def finish(self, iterations: int, view_loss: float | None) -> None:
+        """After all `iterations`: the prediction's error, what leaving the residual out saved, and view dependence.
+
+        `view_loss` is that of `graings.training.view_dependence`, in dB.
+        """
+        plan = _with_view_loss(self.plan, view_loss)
+        if plan.prediction is not None:
+            # A restart repeats steps that no statistic of the capture foresees: it counts as part of the error.
+            prediction = plan.prediction.compared(self.log.clock.train_cpu_s)
+            plan = plan.model_copy(update={"prediction": prediction})
+        decision = plan.decision("residual")
+        before, enough = self._before, len(self._recent) >= MIN_COMPARED_STEPS
+        if decision is not None and decision.iteration is not None and before is not None and enough:
+            saved = (iterations - decision.iteration) * (before - statistics.median(self._recent))
+            saving = decision.saving or Saving(predicted_s=None, predicted_share=None)
+            measured = saving.model_copy(update={"measured_s": saved})
+            plan = plan.revised(decision.model_copy(update={"saving": measured}))
+        self.log.plan = plan
+        self.write()
+
+    def write(self) -> None:
+        """Write plan.json in the run's folder."""
+        write_document(self.log.folder / PLAN_FILE, self.plan)
+
+    def _record(self, decision: Decision, bound: float, iteration: int | None) -> None:
+        assert decision.condition is not None
+        condition = decision.condition.model_copy(update={"value": 255 * bound})
+        update: dict[str, object] = {"condition": condition}
+        if iteration is not None:
+            assert decision.bound is not None
+            update |= {
+                "decision": "drop",
+                "iteration": iteration,
+                "bound": decision.bound.model_copy(update={"value": bound}),
+                "reason": "it changed no training view by half a grey level at two evaluations",
+            }
+        self.log.plan = self.plan.revised(decision.model_copy(update=update))
+
+    def _note_growth(self, event: GrowthQuiet) -> None:
+        decision = self.plan.decision("growth")
+        if decision is None or decision.condition is None:
+            return
+        condition = decision.condition.model_copy(update={"value": float(event.growths)})
+        update = {
+            "decision": "drop" if event.ended else "propose",
+            "iteration": event.iteration,
+            "condition": condition,
+            "reason": f"no anchor was added from there on in {event.growths} growths",
+        }
+        self.log.plan = self.plan.revised(decision.model_copy(update=update))
+
+
+def _with_view_loss(plan: Plan, loss: float | None) -> Plan:
+    """The plan with the measured view dependence; where there is none, the next training may do without."""
+    decision = plan.decision("view_dependence")
+    if loss is None or decision is None or decision.condition is None:
+        return plan
+    condition = decision.condition.model_copy(update={"value": loss})
+    update: dict[str, object] = {"condition": condition}
+    if condition.holds:
+        reason = "the trained model hardly uses the viewing direction: another training may do without"
+        update |= {"decision": "propose", "reason": reason}
+    return plan.revised(decision.model_copy(update=update))
