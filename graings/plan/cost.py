@@ -106,14 +106,12 @@ def visible_pixels(pixels: float, coverage: float) -> float:
     return pixels * (coverage + BACKGROUND_PIXEL * (1.0 - coverage))
 
 
-def predict(
-    statistics: CaptureStatistics, config: TrainConfig, calibration: Calibration, *, temporal: bool | None = None
-) -> Prediction:
+def predict(statistics: CaptureStatistics, config: TrainConfig, calibration: Calibration) -> Prediction:
     """The cost of training with `config`, in which what the plan drops is already left out.
 
-    `temporal` says whether there is a joint phase; None: where the capture has several times.
+    Steps only: the first anchors take some CPU seconds more.
     """
-    loads = _loads(statistics, config, statistics.times > 1 if temporal is None else temporal)
+    loads = _loads(statistics, config)
     cpu_s = sum(steps * _seconds(calibration, load) for steps, load in loads)
     return Prediction(
         cpu_s=cpu_s,
@@ -132,14 +130,14 @@ def expected_anchors(statistics: CaptureStatistics) -> int:
     return max(16, round(ANCHORS_PER_DETAIL * statistics.detail * statistics.pixels))
 
 
-def _loads(statistics: CaptureStatistics, config: TrainConfig, temporal: bool) -> Sequence[tuple[int, Load]]:
+def _loads(statistics: CaptureStatistics, config: TrainConfig) -> Sequence[tuple[int, Load]]:
     """Parts of the training: number of steps, and the load of each. Gaussians are those of one view."""
     children, most = config.scene.children, config.init.max_points
     first = min(most, config.density.max_anchors, statistics.points) if statistics.points else most
     last = min(expected_anchors(statistics), config.density.max_anchors)
     pixels = visible_pixels(statistics.pixels, statistics.coverage)
     views = min(config.batch, statistics.images)
-    temporal = temporal and (config.scene.deformation != "none" or config.scene.residual)
+    temporal = config.scene.deformation != "none" or config.scene.residual
     marks = {
         0,
         config.iterations,

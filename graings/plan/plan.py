@@ -100,8 +100,8 @@ def _with_saving(
     """The decision with what leaving the part out saves against training with all costly parts."""
     if calibration is None or decision.component not in _COSTLY or decision.kind == "user":
         return decision
-    whole = predict(statistics, config, calibration, temporal=True).cpu_s
-    rest = predict(statistics, without(config, [decision.component]), calibration, temporal=True).cpu_s
+    whole = predict(statistics, config, calibration).cpu_s
+    rest = predict(statistics, without(config, [decision.component]), calibration).cpu_s
     saved = max(0.0, whole - rest)
     saving = Saving(predicted_s=saved, predicted_share=min(1.0, saved / max(whole, 1e-9)))
     return decision.model_copy(update={"saving": saving})
