@@ -67,8 +67,8 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
             "projected_clip": False,
             "blur": 0.3,
         },
-        # Random points of Scaffold-GS for captures without a cloud; a cloud is not thinned.
-        "init": {"points": 10_000, "min_mask_fraction": 0.0, "max_points": 2_000_000},
+        # A cloud is not thinned. Where there is none, points of the visual hull stand for those on surfaces.
+        "init": {"max_points": 2_000_000},
         "loss": {
             "ssim": 0.2,
             "temporal": 0.01,

@@ -109,7 +109,7 @@ def visible_pixels(pixels: float, coverage: float) -> float:
 def predict(statistics: CaptureStatistics, config: TrainConfig, calibration: Calibration) -> Prediction:
     """The cost of training with `config`, in which what the plan drops is already left out.
 
-    Steps only: the first anchors take some CPU seconds more.
+    Steps only: making the first anchors is not part of it.
     """
     loads = _loads(statistics, config)
     cpu_s = sum(steps * _seconds(calibration, load) for steps, load in loads)
