@@ -81,6 +81,7 @@ def test_an_evaluation_during_training_draws_each_view_once(
     micro: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = {"evaluation.first": 3, "evaluation.factor": 100.0, "evaluation.views": 2, "guard.check_every": 1000}
+    options["plan.keep"] = ["residual"]  # else the plan draws views of its own, to see whether the residual shows
     run = TrainingRun.create(micro, tmp_path / "run", micro_config(iterations=20, **options))
     drawn = 0
     draw = rasterize_module._draw
