@@ -312,6 +312,7 @@ def _run_config(**changes: object) -> TrainConfig:
     return make_config("paper", {**tiny_paper(), "preset": "paper", **growing, **changes})
 
 
+@pytest.mark.slow(reason="two trainings with checkpoints")
 def test_a_resumed_run_with_learned_anchors_has_the_same_bits(micro: Path, tmp_path: Path) -> None:
     grown = 0
     for report in (whole := TrainingRun.create(micro, tmp_path / "whole", _run_config())):

@@ -153,6 +153,7 @@ def test_masks_without_alpha_exclude_the_background_colour(large_motion: Path) -
     assert all(view.mask.all() and view.opaque for view in masked(flat, ImageStore(WHITE), (0.0, 0.0, 1.0)))
 
 
+@pytest.mark.slow(reason="carves 240 000 points several times")
 def test_without_alpha_the_same_points_and_window_are_chosen(large_motion: Path) -> None:
     count, window = _found(large_motion, _draft())
     without_alpha(large_motion)
