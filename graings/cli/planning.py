@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -51,10 +53,11 @@ def plan(
     if as_json:
         Console().print_json(json.dumps(planned.to_json()))
         return
-    _print(capture, config, planned)
+    options = [*(settings or ()), *(["plan.mode=aggressive"] if aggressive else ())]
+    _print(capture, config, planned, [option for option in options if not option.startswith("preset=")])
 
 
-def _print(capture: Path, config: TrainConfig, planned: Plan) -> None:
+def _print(capture: Path, config: TrainConfig, planned: Plan, options: Sequence[str]) -> None:
     for line in _facts(planned):
         print_line(line)
     console = Console()
@@ -67,7 +70,8 @@ def _print(capture: Path, config: TrainConfig, planned: Plan) -> None:
         print_line(f"note: {warning}")
     for line in _costs(config, planned):
         print_line(line)
-    print_line(f"Train: graings train {capture} -o RUN --preset {config.preset}")
+    command = ["graings", "train", str(capture), "-o", "RUN", "--preset", config.preset]
+    print_line(f"Train: {shlex.join([*command, *(part for option in options for part in ('--set', option))])}")
 
 
 def _facts(planned: Plan) -> list[str]:

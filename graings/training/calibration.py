@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 import time
 from pathlib import Path
@@ -28,6 +29,8 @@ from graings.plan.cost import (
 from graings.report.machine import machine_facts
 from graings.storage.files import write_document
 from graings.training.trainer import Trainer
+
+LOG = logging.getLogger(__name__)
 
 WARM_STEPS: Final = 2
 TIMED_STEPS: Final = 5
@@ -58,8 +61,8 @@ def calibration(threads: int | None = None, folder: Path | None = None) -> Calib
     try:
         place.mkdir(parents=True, exist_ok=True)
         write_document(place / CALIBRATION_FILE, measured)
-    except OSError:
-        pass  # a home without a writable cache: it is measured again next time
+    except OSError as error:
+        LOG.warning("%s: the times of this machine cannot be kept and are measured each time (%s)", place, error)
     return measured
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,16 @@ def test_the_table_names_every_part_and_the_minutes(capsys: pytest.CaptureFixtur
     assert "draft, 1,100 steps: about" in text
     assert f"graings train {capture} -o RUN --preset draft" in text
     assert not (tmp_path / "RUN").exists()
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_the_printed_command_trains_what_was_planned(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    capture = write_fixed(tmp_path / "a capture", lambda c, t: texture(16), cameras=6, times=1, size=16)
+    settings = ("--set", 'plan.keep=["residual"]', "--set", "preset=draft", "--aggressive")
+    (line,) = [line for line in planned(capsys, str(capture), *settings).splitlines() if line.startswith("Train: ")]
+    expected = ["graings", "train", str(capture), "-o", "RUN", "--preset", "draft"]
+    expected += ["--set", 'plan.keep=["residual"]', "--set", "plan.mode=aggressive"]
+    assert shlex.split(line.removeprefix("Train: ")) == expected
 
 
 @pytest.mark.usefixtures("calibrated")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any
 
@@ -66,14 +65,6 @@ def differing(found: Composed, expected: Composed) -> list[str]:
 
 
 GAUSSIANS = fields(scene_of({}).gaussians(EYE, 0.0))
-
-
-@pytest.fixture(params=kernel.available_isas())
-def isa(request: pytest.FixtureRequest) -> Iterator[str]:
-    before = kernel.active_isa()
-    kernel.use_isa(request.param)
-    yield request.param
-    kernel.use_isa(before)
 
 
 @pytest.mark.usefixtures("isa")

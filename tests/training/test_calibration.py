@@ -104,3 +104,12 @@ def test_every_time_of_a_calibration_has_a_factor() -> None:
         "step": 1, "view": 4, "pixel": 4, "gaussian": 1, "gaussian_view": 4, "deformation": 1, "deformation_view": 4,
         "residual_view": 4,
     }  # fmt: skip
+
+
+def test_a_cache_that_cannot_be_written_is_named_and_the_times_are_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(module, "measure_calibration", lambda threads: MADE)
+    (tmp_path / "file").touch()
+    assert calibration(1, tmp_path / "file" / "graings") == MADE
+    assert str(tmp_path / "file" / "graings") in caplog.text
