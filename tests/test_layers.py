@@ -93,13 +93,14 @@ HOMES: dict[str, tuple[str, ...]] = {
     ),
     "OpenImageIO": ("graings.capture", "graings.image_encoding"),
     "pycolmap": ("graings.capture", "graings.training.initialization"),
-    "lpips": ("graings.evaluation.metrics",),
+    "lpips": ("graings.evaluation.perceptual",),
+    "flip_evaluator": ("graings.evaluation.perceptual",),
     "matplotlib": ("graings.report", "graings.ablation.plot"),
     "safetensors": ("graings.storage.checkpoint", "graings.storage.compact"),
 }
 
 # Optional extras, and what takes long to import and is not always used.
-MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "matplotlib"}
+MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "flip_evaluator", "matplotlib"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 

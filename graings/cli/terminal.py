@@ -24,9 +24,12 @@ def metrics_line(split: str, metrics: SplitMetrics) -> str:
     """The means of a split as one line."""
     if metrics.psnr is None:
         return f"{split}: {metrics.reason}"
-    lpips = metrics.lpips_vgg
-    rest = f"LPIPS {lpips:.4f}" if lpips is not None else f"no LPIPS: {metrics.lpips_reason}"
-    return f"{split}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim_3dgs:.4f}, {len(metrics.views)} views; {rest}"
+    lpips, flip = metrics.lpips_vgg, metrics.flip_ldr
+    quality = f"{split}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim_3dgs:.4f}, {len(metrics.views)} views"
+    known = [f"{name} {value:.4f}" for name, value in (("LPIPS", lpips), ("FLIP", flip)) if value is not None]
+    missing = [f"no LPIPS: {metrics.lpips_reason}"] if lpips is None else []
+    missing += [f"no FLIP: {metrics.flip_reason}"] if flip is None else []
+    return "; ".join([", ".join([quality, *known]), *missing])
 
 
 def motion_line(motion: MotionMetrics) -> str:

@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
-from graings.evaluation.metrics import Lpips, SplitMetrics, measure_split
+from graings.evaluation.metrics import SplitMetrics, measure_split
+from graings.evaluation.perceptual import PerceptualDistances
 from graings.render import render
 from graings.scene.prepared import PreparedScene
 from graings.scene.scene import Scene
@@ -21,7 +22,7 @@ def evaluate(
     images: ImageStore,
     background: Sequence[float],
     *,
-    lpips: Lpips | None = None,
+    distances: PerceptualDistances | None = None,
 ) -> SplitMetrics:
     """Metrics of `scene` on `frames`: each view rendered at its own camera and time."""
     prepared = PreparedScene(scene)
@@ -31,7 +32,7 @@ def evaluate(
             rendered = render(prepared, frame.camera, frame.time, background)
             yield frame.name, frame.time, rendered.color.clamp(0, 1).numpy(), images.rgb(frame)
 
-    return measure_split(pairs(), lpips)
+    return measure_split(pairs(), distances)
 
 
 def subset(frames: Sequence[Frame], size: int) -> tuple[Frame, ...]:

@@ -7,32 +7,21 @@ away from `ssim_3dgs` for the same two images. Images are [H, W, 3] in [0, 1].
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
-import warnings
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Final
 
 import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from graings.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from graings.document import Document
-
-Image = NDArray[np.float64]
+from graings.evaluation.perceptual import LPIPS_MIN_SIDE, Image, PerceptualDistances
 
 # Below this mean squared error PSNR is 100 dB: the logarithm of 0, the error of two equal images, is not finite.
 MSE_FLOOR: Final = 1e-10
 PSNR_CAP: Final = 100.0
-
-# VGG halves the image five times, which leaves no pixel of a smaller image.
-LPIPS_MIN_SIDE: Final = 32
-# torchvision names weight files after the first digits of their sha256.
-VGG_FILE: Final = "vgg16-397923af.pth"
 
 
 class ViewMetrics(Document):
@@ -43,6 +32,7 @@ class ViewMetrics(Document):
     psnr: float = Field(le=PSNR_CAP, description="Peak signal-to-noise ratio in dB; 100 for equal images.")
     ssim_3dgs: float = Field(ge=-1, le=1, description="Structural similarity as 3D Gaussian Splatting computes it.")
     lpips_vgg: float | None = Field(description="LPIPS distance with VGG weights; null where it was not measured.")
+    flip_ldr: float | None = Field(description="Mean LDR-FLIP error in [0, 1]; null where it was not measured.")
     mse: float = Field(ge=0, description="Mean squared error over pixels and channels in [0, 1].")
 
 
@@ -53,6 +43,8 @@ class SplitMeans(Document):
     ssim_3dgs: float | None = Field(ge=-1, le=1, description="Mean over views; null without a view.")
     lpips_vgg: float | None = Field(description="Mean over views; null where any view has none.")
     lpips_reason: str | None = Field(description="Why `lpips_vgg` is null; null where it is not.")
+    flip_ldr: float | None = Field(description="Mean over views of LDR-FLIP; null where any view has none.")
+    flip_reason: str | None = Field(description="Why `flip_ldr` is null; null where it is not.")
     saturated: bool = Field(
         description="Whether some image equals its photograph to the last bit: its PSNR is then the cap of 100 dB."
     )
@@ -65,8 +57,8 @@ class SplitMetrics(SplitMeans):
     views: tuple[ViewMetrics, ...] = Field(description="The views, in the order of the split.")
 
     @staticmethod
-    def over(views: Sequence[ViewMetrics], lpips_reason: str | None = None) -> SplitMetrics:
-        """Average `views`; `lpips_reason` is that of the `Lpips` that measured them."""
+    def over(views: Sequence[ViewMetrics], distances: PerceptualDistances | None = None) -> SplitMetrics:
+        """Average `views`; `distances` are those that were measured on them, None for none."""
         if not views:
             reason = "the split has no images"
             return SplitMetrics(
@@ -74,49 +66,64 @@ class SplitMetrics(SplitMeans):
                 ssim_3dgs=None,
                 lpips_vgg=None,
                 lpips_reason=reason,
+                flip_ldr=None,
+                flip_reason=reason,
                 saturated=False,
                 reason=reason,
                 views=(),
             )
-        lpips = [view.lpips_vgg for view in views if view.lpips_vgg is not None]
-        complete = len(lpips) == len(views)
-        if not complete and lpips_reason is None:
-            lpips_reason = f"images under {LPIPS_MIN_SIDE} pixels have no LPIPS"
+        lpips = _mean_of_all([view.lpips_vgg for view in views])
+        flip = _mean_of_all([view.flip_ldr for view in views])
+        lpips_reason, flip_reason = "LPIPS was not requested", "FLIP was not requested"
+        if distances is not None:
+            lpips_reason = distances.lpips.reason or f"images under {LPIPS_MIN_SIDE} pixels have no LPIPS"
+            flip_reason = distances.flip.reason or "some views were not measured"
         return SplitMetrics(
             psnr=math.fsum(view.psnr for view in views) / len(views),
             ssim_3dgs=math.fsum(view.ssim_3dgs for view in views) / len(views),
-            lpips_vgg=math.fsum(lpips) / len(lpips) if complete else None,
-            lpips_reason=None if complete else lpips_reason,
+            lpips_vgg=lpips,
+            lpips_reason=lpips_reason if lpips is None else None,
+            flip_ldr=flip,
+            flip_reason=flip_reason if flip is None else None,
             saturated=any(view.mse <= MSE_FLOOR for view in views),
             views=tuple(views),
         )
 
 
-def measure_split(pairs: Iterable[tuple[str, float, ArrayLike, ArrayLike]], lpips: Lpips | None = None) -> SplitMetrics:
+def measure_split(
+    pairs: Iterable[tuple[str, float, ArrayLike, ArrayLike]], distances: PerceptualDistances | None = None
+) -> SplitMetrics:
     """Metrics of a split from its (name, time, image, photograph), one pair in memory at a time."""
-    views = tuple(measure(name, time, image, target, lpips) for name, time, image, target in pairs)
-    reason = "LPIPS was not requested" if lpips is None else lpips.reason
-    return SplitMetrics.over(views, reason)
+    views = tuple(measure(name, time, image, target, distances) for name, time, image, target in pairs)
+    return SplitMetrics.over(views, distances)
 
 
-def measure(name: str, time: float, image: ArrayLike, target: ArrayLike, lpips: Lpips | None = None) -> ViewMetrics:
+def measure(
+    name: str, time: float, image: ArrayLike, target: ArrayLike, distances: PerceptualDistances | None = None
+) -> ViewMetrics:
     """All metrics of one image."""
-    image_, target_ = _pair(image, target)
+    image_, target_ = _rounded_pair(image, target)
     error = _mse(image_, target_)
-    distance = lpips(image_, target_) if lpips is not None else None
     return ViewMetrics(
         name=name,
         time=float(time),
         psnr=_psnr_of(error),
         ssim_3dgs=_ssim(image_, target_),
-        lpips_vgg=distance,
+        lpips_vgg=None if distances is None else distances.lpips(image_, target_),
+        flip_ldr=None if distances is None else distances.flip(image_, target_),
         mse=error,
     )
 
 
+def _mean_of_all(values: Sequence[float | None]) -> float | None:
+    """The mean, or None where any value is missing."""
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if len(known) == len(values) else None
+
+
 def psnr(image: ArrayLike, target: ArrayLike) -> float:
     """Peak signal-to-noise ratio in dB, -10 log10 MSE, at most 100."""
-    return _psnr_of(_mse(*_pair(image, target)))
+    return _psnr_of(_mse(*_rounded_pair(image, target)))
 
 
 def ssim_3dgs(image: ArrayLike, target: ArrayLike) -> float:
@@ -125,60 +132,10 @@ def ssim_3dgs(image: ArrayLike, target: ArrayLike) -> float:
     Gaussian window of 11 x 11 with sigma 1.5, borders padded with zeros, mean over pixels and channels; in
     float64, with variances kept from falling below zero by rounding (Wang et al. 2004, Eq. 13).
     """
-    return _ssim(*_pair(image, target))
+    return _ssim(*_rounded_pair(image, target))
 
 
-class Lpips:
-    """Learned perceptual distance with VGG weights (Zhang et al. 2018), if they are on this machine.
-
-    `reason` names what is missing; every distance is None then. Nothing is ever downloaded.
-    """
-
-    def __init__(self, network: torch.nn.Module | None, reason: str | None) -> None:
-        self._network = network
-        self.reason = reason
-
-    @staticmethod
-    def find() -> Lpips:
-        """The package `lpips` with its VGG backbone from `$TORCH_HOME`, or the reason why there is none."""
-        try:
-            import lpips  # optional extra [lpips]
-        except ModuleNotFoundError:
-            return Lpips(None, "the package lpips is not installed (pip install 'graings[lpips]')")
-        except (ImportError, RuntimeError) as error:
-            # A torchvision built for another torch raises these; a run must not fail for an optional metric.
-            return Lpips(None, f"the package lpips does not load: {error}")
-        problem = _backbone_problem(Path(torch.hub.get_dir()) / "checkpoints" / VGG_FILE)
-        if problem is not None:
-            return Lpips(None, problem)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # lpips calls torchvision by deprecated names
-            network: torch.nn.Module = lpips.LPIPS(net="vgg", verbose=False)
-        return Lpips(network.eval().requires_grad_(False), None)
-
-    def __call__(self, image: ArrayLike, target: ArrayLike) -> float | None:
-        """Distance of two images, or None without weights or below 32 pixels."""
-        image_, target_ = _pair(image, target)
-        if self._network is None or min(image_.shape[:2]) < LPIPS_MIN_SIDE:
-            return None
-        with torch.inference_mode():
-            batch = [torch.from_numpy(x).float().permute(2, 0, 1)[None] * 2.0 - 1.0 for x in (image_, target_)]
-            return float(self._network(*batch))
-
-
-def _backbone_problem(file: Path) -> str | None:
-    """Why the VGG backbone cannot be used, or None. Its file name carries the start of its sha256."""
-    where = f"{VGG_FILE} in $TORCH_HOME/hub/checkpoints"
-    if not file.is_file() or not os.access(file, os.R_OK):
-        return f"the VGG weights are not installed ({where})"
-    with file.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    if not digest.startswith(VGG_FILE[6:14]):
-        return f"the VGG weights are damaged: the checksum does not fit the name ({where})"
-    return None
-
-
-def _pair(image: ArrayLike, target: ArrayLike) -> tuple[Image, Image]:
+def _rounded_pair(image: ArrayLike, target: ArrayLike) -> tuple[Image, Image]:
     """Both images in float64, rounded to 8 bits."""
     pair = []
     for name, values in (("image", image), ("target", target)):

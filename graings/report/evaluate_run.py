@@ -11,8 +11,9 @@ from graings.capture.load import load_capture
 from graings.capture.trajectories import read_trajectories
 from graings.errors import CheckpointError
 from graings.evaluation.evaluate import evaluate
-from graings.evaluation.metrics import Lpips, SplitMetrics
+from graings.evaluation.metrics import SplitMetrics
 from graings.evaluation.motion import MotionMetrics, measure_motion
+from graings.evaluation.perceptual import PerceptualDistances
 from graings.report.metrics_document import METRICS_FILE, read_metrics
 from graings.report.run_record import read_record
 from graings.storage.compact import open_model
@@ -40,7 +41,7 @@ def evaluate_run(
     frames = data.split(split)
     color = model.background if background is None else background
     images = ImageStore(color, model.config.capture.cache_mb)
-    metrics = evaluate(model.scene, frames, images, color, lpips=Lpips.find())
+    metrics = evaluate(model.scene, frames, images, color, distances=PerceptualDistances.find())
     if background is not None:
         return metrics
     document = read_metrics(run / METRICS_FILE)

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
-from graings.evaluation.metrics import Lpips, SplitMetrics, measure_split
+from graings.evaluation.metrics import SplitMetrics, measure_split
+from graings.evaluation.perceptual import PerceptualDistances
 from graings.render import render_composition
 from graings.scene.prepared import PreparedScene
 from graings.scene.scene import Scene
@@ -37,7 +38,7 @@ class HeldOut:
         frames: Sequence[Frame],
         images: ImageStore,
         background: Sequence[float],
-        lpips: Lpips | None = None,
+        distances: PerceptualDistances | None = None,
     ) -> HeldOut:
         """Draw each of at least one view in `frames` once."""
         footprints, seconds = SubpixelCounter(scene), list[float]()
@@ -53,6 +54,6 @@ class HeldOut:
                 footprints.add(composition, result.radii, frame.camera)
                 yield frame.name, frame.time, result.color.clamp(0, 1).numpy(), images.rgb(frame)
 
-        metrics = measure_split(pairs(), lpips)
+        metrics = measure_split(pairs(), distances)
         fps = 1.0 / max(statistics.median(seconds[1:] or seconds), 1e-9)
         return HeldOut(metrics, fps, footprints.share())

@@ -13,7 +13,8 @@ from graings.capture.capture import ALL_SPLITS, Frame, Split
 from graings.capture.images import ImageStore
 from graings.errors import CheckpointError
 from graings.evaluation.evaluate import evaluate, subset
-from graings.evaluation.metrics import Lpips, SplitMetrics
+from graings.evaluation.metrics import SplitMetrics
+from graings.evaluation.perceptual import PerceptualDistances
 from graings.kernel import thread_count
 from graings.report.metrics_document import CompactFacts, EvaluationPoint
 from graings.storage.checkpoint import TrainingState, best_checkpoint, load_model, load_state, save_checkpoint
@@ -75,7 +76,7 @@ class RunOutput:
             self.render_fps = HeldOut.measure(trainer.scene, some, self.images, trainer.background).frames_per_second
             self.log.clock.add("evaluation", time.perf_counter() - started)
             return None, {}
-        held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background, Lpips.find())
+        held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background, PerceptualDistances.find())
         self.render_fps = held_out.frames_per_second
         chosen = {frame.name for frame in self.held_out()}
         of_curve = SplitMetrics.over([view for view in held_out.metrics.views if view.name in chosen])
@@ -89,7 +90,7 @@ class RunOutput:
             return {}
         started = time.perf_counter()
         frames = self.log.capture.val
-        held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background, Lpips.find())
+        held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background, PerceptualDistances.find())
         self.render_fps = held_out.frames_per_second
         self.log.clock.add("evaluation", time.perf_counter() - started)
         return {"val": held_out.metrics}

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from pathlib import Path
@@ -14,16 +13,7 @@ from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
 from graings.config import CaptureConfig
 from graings.evaluation.evaluate import evaluate
-from graings.evaluation.metrics import (
-    VGG_FILE,
-    Lpips,
-    SplitMetrics,
-    _backbone_problem,
-    measure,
-    measure_split,
-    psnr,
-    ssim_3dgs,
-)
+from graings.evaluation.metrics import SplitMetrics, measure, measure_split, psnr, ssim_3dgs
 from tests.models import tiny_scene
 
 
@@ -131,42 +121,9 @@ def test_an_empty_split_has_no_numbers_but_a_reason() -> None:
     assert document["views"] == []
 
 
-def test_absent_perceptual_weights_are_named_and_never_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    lpips = Lpips.find()
-    assert lpips.reason is not None
-    assert lpips(noise(0, 40, 40), noise(1, 40, 40)) is None
-    split = measure_split([("v", 0.0, noise(0, 40, 40), noise(1, 40, 40))], lpips)
-    assert split.lpips_vgg is None
-    assert split.lpips_reason == lpips.reason
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_damaged_perceptual_weights_are_distinguished_from_absent_ones(tmp_path: Path) -> None:
-    file = tmp_path / VGG_FILE
-    assert "not installed" in str(_backbone_problem(file))
-    file.write_bytes(b"half a download")
-    assert not hashlib.sha256(file.read_bytes()).hexdigest().startswith("397923af")
-    assert "damaged" in str(_backbone_problem(file))
-
-
-def test_images_too_small_for_the_network_have_no_perceptual_distance() -> None:
-    class OneForAll(torch.nn.Module):
-        def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-            return (a - b).abs().mean()
-
-    lpips = Lpips(OneForAll(), None)
-    small, large = (measure("v", 0.0, noise(0, n, n), noise(1, n, n), lpips) for n in (31, 32))
-    assert small.lpips_vgg is None
-    assert large.lpips_vgg is not None
-    split = SplitMetrics.over((small, large), lpips.reason)
-    assert split.lpips_vgg is None
-    assert "under 32 pixels" in str(split.lpips_reason)
-    assert SplitMetrics.over((large,), lpips.reason).lpips_vgg == large.lpips_vgg
-
-
 def test_without_a_distance_the_reason_is_that_none_was_requested(tmp_path: Path) -> None:
     capture = load_capture(write_synthetic(tmp_path / "c", frames=4, size=40), CaptureConfig())
     images = ImageStore((1.0, 1.0, 1.0), 64)
     found = evaluate(tiny_scene(anchors=4), capture.train[:1], images, (1.0, 1.0, 1.0))
     assert (found.lpips_vgg, found.lpips_reason) == (None, "LPIPS was not requested")
+    assert (found.flip_ldr, found.flip_reason) == (None, "FLIP was not requested")
