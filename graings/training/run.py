@@ -144,6 +144,11 @@ class TrainingRun:
         return self._restart.iterations_before + self._trainer.iteration
 
     @property
+    def trainer(self) -> Trainer:
+        """The optimisation in progress; another one after a restart."""
+        return self._trainer
+
+    @property
     def iterations(self) -> int:
         """Iterations planned; a restart adds those that were spent before it."""
         return self._restart.iterations_before + self.config.iterations

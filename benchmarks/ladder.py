@@ -1,0 +1,173 @@
+"""The ladder from the method as printed to preset `fine`: what each group of our additions is worth.
+
+    python benchmarks/ladder.py FOLDER CAPTURE... [--views 20000] [--seed 0] [--threads 1] [--only ROW ...]
+
+Every row keeps the additions of the rows above it. All rows see equally many training views at 400 px; the last row is
+`fine` at that length, which the script checks before it trains. Runs lie in FOLDER/CAPTURE/ROW; what is finished is not
+repeated, an interrupted run is resumed. FOLDER/ladder.md is written after every run: PSNR of the validation
+views in dB and its difference to the row above, CPU minutes of training, MB in float32.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from graings.config import TrainConfig, make_config
+from graings.report.metrics_document import METRICS_FILE, Metrics, read_metrics
+from graings.storage.run_folder import RECORD_FILE
+from graings.training.run import TrainingRun
+
+FINE = make_config("fine")
+BATCH = FINE.batch
+
+
+@dataclass(frozen=True)
+class Row:
+    """One step of the ladder: the options, by dotted name, that take their value of `fine` from here on."""
+
+    name: str
+    label: str
+    options: tuple[str, ...]
+
+
+ROWS = (
+    Row("printed", "the method as printed", ()),
+    Row(
+        "batch", "four views a step, short warm-up, growth as often per view", ("batch", "warmup", "density.grow_every")
+    ),
+    Row("time", "time conditioning factorized", ("scene.time_conditioning",)),
+    Row("l_temp", "L_temp a mean over time, not a sum", ("loss.temporal_sum",)),
+    Row("rigidity", "rigidity", ("loss.rigidity",)),
+    Row("squared", "squared error after growth, alpha loss", ("loss.squared", "loss.alpha")),
+    Row(
+        "anchors",
+        "anchors fixed, scales relative, new anchors as opaque as their parent",
+        ("scene.learnable_anchors", "scene.relative_scales", "density.new_anchor_opacity"),
+    ),
+    Row(
+        "opacity",
+        "opacity does not see the view; residual detached from the feature",
+        ("scene.opacity_view", "scene.residual_stop_gradient"),
+    ),
+    Row("color", "view harmonics and mirrored direction", ("scene.color_sh_degree", "scene.reflection")),
+    Row("residual", "residual colour sees the view", ("scene.residual_sh_degree",)),
+    Row("blur", "low-pass filter 0.1", ("scene.blur",)),
+    Row("rates", "learning rates, projected clips", ("rates", "scene.projected_clip")),
+    Row("muon", "Muon for weight matrices", ("matrix_optimizer",)),
+    Row(
+        "budget",
+        "anchor budget, first points thinned to it",
+        ("init.max_points", "density.max_growth", "density.max_anchors", "density.memory_mb"),
+    ),
+    Row("average", "averaging of the last steps", ("average_from",)),
+    Row(
+        "curriculum",
+        "time window, guard that rolls back, background of the capture",
+        ("time_window", "guard", "capture.background"),
+    ),
+)
+
+
+def option(config: TrainConfig, name: str) -> Any:
+    value: Any = config
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value.model_dump() if hasattr(value, "model_dump") else value
+
+
+def nested(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by dotted name as nested dictionaries."""
+    tree: dict[str, Any] = {}
+    for name, value in options.items():
+        *parts, last = name.split(".")
+        owner = tree
+        for part in parts:
+            owner = owner.setdefault(part, {})
+        owner[last] = value
+    return tree
+
+
+def config_of(index: int, views: int, seed: int, threads: int) -> TrainConfig:
+    """Options of row `index` at this many training views."""
+    taken = {name: option(FINE, name) for row in ROWS[: index + 1] for name in row.options}
+    batch = taken.get("batch", 1)
+    run = {"iterations": views // batch, "capture.max_side": 400, "seed": seed, "threads": threads}
+    return make_config("paper", nested({**taken, **run}))
+
+
+def check_ladder(views: int) -> None:
+    """Raise `SystemExit` naming the options in which the last row is not `fine`."""
+    end = config_of(len(ROWS) - 1, views, 0, 1).model_dump()
+    fine = make_config("fine", {"iterations": views // BATCH, "seed": 0, "threads": 1}).model_dump()
+    different = [key for key in fine if key != "preset" and end[key] != fine[key]]
+    if different:
+        raise SystemExit(f"the last row is not fine: {different}. Add the options to a row.")
+
+
+def train(folder: Path, capture: Path, config: TrainConfig) -> None:
+    """Train a run to its end, or resume it; nothing where it is finished."""
+    if finished(folder) is not None:
+        return
+    run = TrainingRun.resume(folder) if (folder / RECORD_FILE).exists() else TrainingRun.create(capture, folder, config)
+    for report in run:
+        if report.evaluation is not None:
+            print(f"{folder.name}  {report.iteration:,}  {report.evaluation.psnr:.2f} dB", flush=True)
+
+
+def finished(folder: Path) -> Metrics | None:
+    """Metrics of the last iteration."""
+    if not (folder / METRICS_FILE).exists():
+        return None
+    metrics = read_metrics(folder / METRICS_FILE)
+    return metrics if "val" in metrics.splits else None
+
+
+def table(folder: Path, captures: list[Path]) -> Iterator[str]:
+    """The table as Markdown."""
+    yield "| row | " + " | ".join(f"{c.name}: dB | to the row above | CPU min | MB" for c in captures) + " |"
+    yield "|---" * (1 + 4 * len(captures)) + "|"
+    above: dict[Path, float | None] = dict.fromkeys(captures)
+    for row in ROWS:
+        cells = [row.label]
+        for capture in captures:
+            metrics = finished(folder / capture.name / row.name)
+            psnr = None if metrics is None else metrics.splits["val"].psnr
+            before, above[capture] = above[capture], psnr
+            if metrics is None or psnr is None:
+                cells += ["", "", "", ""]
+                continue
+            cells += [
+                f"{psnr:.2f}",
+                "" if before is None else f"{psnr - before:+.2f}",
+                f"{metrics.train_cpu_s / 60:.0f}",
+                f"{metrics.bytes.fp32 / 1e6:.2f}",
+            ]
+        yield "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    """Train the ladder and write its table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("captures", type=Path, nargs="+")
+    parser.add_argument("--views", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--only", nargs="+", default=[row.name for row in ROWS], choices=[row.name for row in ROWS])
+    args = parser.parse_args()
+    check_ladder(args.views)
+    for capture in args.captures:
+        for index, row in enumerate(ROWS):
+            if row.name in args.only:
+                config = config_of(index, args.views, args.seed, args.threads)
+                train(args.folder / capture.name / row.name, capture, config)
+                (args.folder / "ladder.md").write_text("\n".join(table(args.folder, args.captures)) + "\n")
+    print("\n".join(table(args.folder, args.captures)))
+
+
+if __name__ == "__main__":
+    main()
