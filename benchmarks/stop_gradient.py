@@ -148,16 +148,17 @@ def figure(folder: Path, seed: int) -> str:
         panels = [new_panel(page, left, left + 240, 90, 270) for left in (64, 378, 692)]
         for row, curve in curves.items():
             steps, color, label = curve["iteration"], COLORS[row], LABELS[row]
-            panels[0].plot(steps, curve["direct"], color=color, label=f"direct, {label}")
-            panels[0].plot(steps, curve["blocked"], color=color, linestyle="--", label=f"through DeformNet, {label}")
+            panels[0].plot(steps, curve["direct"], color=color, label=label)
+            panels[0].plot(steps, curve["blocked"], color=color, linestyle="--")
             panels[1].plot(steps, curve["cosine"], color=color)
             panels[2].plot(steps, [100 * value for value in curve["drift_median"]], color=color)
             panels[2].plot(steps, [100 * value for value in curve["drift_p90"]], color=color, linestyle=":")
         panels[0].set_yscale("log")
-        panels[0].set_title("norm of the gradient of the positions", loc="left")
+        panels[0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        panels[0].set_title("gradient norm: direct, blocked (dashed)", loc="left")
         panels[1].axhline(0, color="#9aa0a6", linewidth=0.8)
-        panels[1].set_title("cosine of the two", loc="left")
-        panels[2].set_title("drift in % of the extent: median, 90 % (dotted)", loc="left")
+        panels[1].set_title("cosine of direct and blocked", loc="left")
+        panels[2].set_title("drift in %: median, p90 (dotted)", loc="left")
         for panel in panels:
             panel.set_xlabel("iteration")
         page.legend(*panels[0].get_legend_handles_labels(), loc="upper left", bbox_to_anchor=(0.02, 0.87), ncols=4)
