@@ -28,6 +28,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.camera": (),
     "graings.kernel": (),
     "graings.capture": ("graings.camera", "graings.config"),
+    "graings.footage": ("graings.storage.files",),
     "graings.scene": ("graings.camera", "graings.config", "graings.kernel"),
     "graings.raster": ("graings.camera", "graings.kernel"),
     "graings.render": ("graings.camera", "graings.raster", "graings.scene"),  # they meet here and nowhere else
@@ -59,7 +60,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
-        *("graings.kernel", "graings.plan", "graings.render", "graings.report", "graings.storage"),
+        *("graings.footage", "graings.kernel", "graings.plan", "graings.render", "graings.report", "graings.storage"),
         "graings.training",
     ),
     # Durable work knows the method by its options and files; one child process trains.
@@ -83,16 +84,17 @@ HOMES: dict[str, tuple[str, ...]] = {
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
     "typer": (
-        *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.synthesize"),
-        *("graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
+        *("graings.cli.footage", "graings.cli.main", "graings.cli.option_table", "graings.cli.planning"),
+        *("graings.cli.synthesize", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
     ),
     "rich": (
         *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.progress"),
-        "graings.cli.synthesize",
+        *("graings.cli.footage", "graings.cli.synthesize"),
         *("graings.cli.terminal", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
     ),
-    "OpenImageIO": ("graings.capture", "graings.image_encoding"),
-    "pycolmap": ("graings.capture", "graings.training.initialization"),
+    "OpenImageIO": ("graings.capture", "graings.footage.photos", "graings.image_encoding"),
+    "pycolmap": ("graings.capture", "graings.footage", "graings.training.initialization"),
+    "av": ("graings.footage.video",),
     "lpips": ("graings.evaluation.perceptual",),
     "flip_evaluator": ("graings.evaluation.perceptual",),
     "matplotlib": ("graings.report", "graings.ablation.plot"),
@@ -100,7 +102,7 @@ HOMES: dict[str, tuple[str, ...]] = {
 }
 
 # Optional extras, and what takes long to import and is not always used.
-MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "flip_evaluator", "matplotlib"}
+MAY_BE_IMPORTED_LATE = {"av", "pycolmap", "lpips", "flip_evaluator", "matplotlib"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 

@@ -22,6 +22,7 @@ from rich.text import Text
 
 from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.camera.viewpoint import background_rgb
+from graings.cli.footage import capture
 from graings.cli.option_table import show_options
 from graings.cli.planning import plan
 from graings.cli.synthesize import synthesize
@@ -92,6 +93,7 @@ def graings() -> None:
 app.command()(train)
 app.command()(plan)
 app.command()(synthesize)
+app.command()(capture)
 app.command(cls=MultiValueCommand)(ablate)
 app.command(name="options")(show_options)
 

@@ -1,0 +1,180 @@
+"""make_capture: a capture from a video or a folder of photographs without poses.
+
+Frames, camera poses, undistorted images and first points, in the single-file layout of nerfstudio. What is done so far
+lies in `.footage` of the capture's folder; a call that was interrupted continues there.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from graings.document import read_document
+from graings.errors import CaptureError
+from graings.footage.frame_document import FootageFrames
+from graings.footage.photos import convert_photographs, photographs
+from graings.footage.poses import reconstruct
+from graings.footage.registration import MIN_TRACK, measure, refuse_unusable, upright
+from graings.footage.report import REPORT_FILE, FootageReport
+from graings.footage.sharpness import blurred
+from graings.footage.video import extract_frames
+from graings.storage.files import write_document, write_json
+
+if TYPE_CHECKING:
+    import pycolmap
+
+WORKSPACE: Final = ".footage"
+TRANSFORMS: Final = "transforms.json"
+POINTS: Final = "points.ply"
+
+Observe = Callable[[str, int, int], None]
+
+
+def make_capture(
+    source: Path,
+    target: Path,
+    *,
+    frames: int = 100,
+    max_side: int = 1000,
+    static: bool = False,
+    threads: int = 1,
+    observe: Observe = lambda phase, done, total: None,
+) -> FootageReport:
+    """Write the capture of `source` to the folder `target` and return what was found.
+
+    Of a video at most `frames` frames are taken, of a folder all photographs; images have no side above `max_side` px.
+    A `static` capture has no times. `observe` is called with the phase, what is done of it and its total. Raises
+    `CaptureError` where the source cannot be read, where its frames do not fit together, and for a `target` that holds
+    a capture.
+    """
+    if not source.exists():
+        raise CaptureError("does not exist", file=source, remedy="Give a video or a folder of photographs.")
+    if (target / TRANSFORMS).exists():
+        raise CaptureError("holds a capture already", file=target, remedy="Choose another folder.")
+    workspace = target / WORKSPACE
+    (workspace / "frames").mkdir(parents=True, exist_ok=True)
+    seconds: dict[str, float] = {}
+    observe_timed = _timed(observe, seconds)
+
+    taken = _frames(source, workspace, frames, max_side, observe_timed)
+    names = [frame.name for frame in taken.frames]
+    model = reconstruct(workspace / "frames", names, workspace, threads, observe_timed)
+    found = refuse_unusable(None if model is None else measure(model), len(names), source)
+    assert model is not None
+    observe_timed("undistortion", 0, 1)
+    times = {} if static else {frame.name: frame.time for frame in taken.frames}
+    _write_capture(model, workspace, target, times)
+    observe_timed("undistortion", 1, 1)
+    registered = [times[name] for name in found.names if name in times]
+    report = FootageReport(
+        source=taken.source,
+        seen=taken.seen,
+        taken=len(names),
+        registered=len(found.names),
+        left_out=tuple(sorted(set(names) - set(found.names))),
+        blurred=taken.blurred,
+        points=found.points,
+        reprojection_error=found.reprojection_error,
+        track_length=found.track_length,
+        parallax=found.parallax,
+        path_over_depth=found.path_over_depth,
+        duration=max(registered) - min(registered) if registered else 0.0,
+        camera=found.camera,
+        notes=taken.notes,
+        seconds=seconds,
+    )
+    write_document(target / REPORT_FILE, report)
+    shutil.rmtree(workspace)
+    return report
+
+
+def _timed(observe: Observe, seconds: dict[str, float]) -> Observe:
+    """`observe`, which also adds the seconds since the last call to the phase."""
+    last = time.perf_counter()
+
+    def note(phase: str, done: int, total: int) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        seconds[phase] = seconds.get(phase, 0.0) + now - last
+        last = now
+        observe(phase, done, total)
+
+    return note
+
+
+def _frames(source: Path, workspace: Path, count: int, max_side: int, observe: Observe) -> FootageFrames:
+    """The frames in the workspace: those of an earlier call, or new ones."""
+    record = workspace / "frames.json"
+    if record.exists():
+        known = read_document(record, FootageFrames, f"Delete {workspace} to begin again.")
+        if known.source != source.name:
+            remedy = f"Give that one, or delete {workspace}."
+            raise CaptureError(f"was begun with {known.source}, not {source.name}", file=workspace, remedy=remedy)
+        return known
+    target, notes = workspace / "frames", tuple[str, ...]()
+    if source.is_dir():
+        photos = photographs(source)
+        if not photos:
+            raise CaptureError("holds no photographs", file=source, remedy="Give a video or a folder of photographs.")
+        seen = len(photos)
+        frames, notes = convert_photographs(photos, target, max_side, lambda d, n: observe("frames", d, n))
+    else:
+        seen, frames = extract_frames(source, target, count, max_side, lambda d, n: observe("frames", d, n))
+    unsharp = blurred([frame.sharpness for frame in frames])
+    kept = tuple(frame for frame, out in zip(frames, unsharp, strict=True) if not out)
+    left_out = tuple(frame.name for frame, out in zip(frames, unsharp, strict=True) if out)
+    document = FootageFrames(source=source.name, seen=seen, frames=kept, blurred=left_out, notes=notes)
+    write_document(record, document)
+    return document
+
+
+def _write_capture(model: pycolmap.Reconstruction, workspace: Path, target: Path, times: dict[str, float]) -> None:
+    """Undistorted images, cameras and points. `transforms.json` comes last: with it the capture is complete."""
+    import pycolmap
+
+    rotation = pycolmap.Rotation3d(upright(model))
+    model.transform(pycolmap.Sim3d(1.0, rotation, np.zeros(3)))
+    best, undistorted = workspace / "best", workspace / "undistorted"
+    best.mkdir(exist_ok=True)
+    model.write(best)
+    shutil.rmtree(undistorted, ignore_errors=True)
+    pycolmap.undistort_images(undistorted, best, workspace / "frames")
+    pinhole = pycolmap.Reconstruction(undistorted / "sparse")
+    for key, point in list(pinhole.points3D.items()):
+        if point.track.length() < MIN_TRACK:
+            pinhole.delete_point3D(key)
+    pinhole.export_PLY(target / POINTS)
+    shutil.rmtree(target / "images", ignore_errors=True)
+    shutil.move(undistorted / "images", target / "images")
+    images = sorted((pinhole.image(key) for key in pinhole.reg_image_ids()), key=lambda image: image.name)
+    write_json(
+        target / TRANSFORMS,
+        {
+            "camera_model": "PINHOLE",
+            "ply_file_path": POINTS,
+            "frames": [_frame(image, pinhole.camera(image.camera_id), times.get(image.name)) for image in images],
+        },
+    )
+
+
+def _frame(image: pycolmap.Image, camera: pycolmap.Camera, moment: float | None) -> dict[str, Any]:
+    """The entry of one image: intrinsics in px, camera-to-world with OpenGL axes, time in seconds."""
+    world_from_camera = np.eye(4)
+    world_from_camera[:3] = image.cam_from_world().inverse().matrix()
+    world_from_camera[:, 1:3] *= -1  # OpenCV's y down, z forward to OpenGL's y up, z back
+    return {
+        "file_path": f"images/{image.name}",
+        "fl_x": camera.focal_length_x,
+        "fl_y": camera.focal_length_y,
+        "cx": camera.principal_point_x,
+        "cy": camera.principal_point_y,
+        "w": camera.width,
+        "h": camera.height,
+        "transform_matrix": world_from_camera.tolist(),
+        **({} if moment is None else {"time": moment}),
+    }

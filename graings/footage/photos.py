@@ -1,0 +1,80 @@
+"""Photographs of a folder as frames: upright, no larger than needed, with the times of their EXIF tags."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import OpenImageIO as oiio
+
+from graings.errors import CaptureError
+from graings.footage.frame_document import FootageFrame
+from graings.footage.sharpness import WIDTH, sharpness
+from graings.image_encoding import encode_image
+from graings.storage.files import write_bytes
+
+SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".bmp"}
+PNG_LEVEL: Final = 1
+
+
+def photographs(folder: Path) -> list[Path]:
+    """The images of `folder`, in order of their names."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+
+
+def convert_photographs(
+    photos: list[Path], target: Path, max_side: int, observe: Callable[[int, int], None]
+) -> tuple[tuple[FootageFrame, ...], tuple[str, ...]]:
+    """Write `photos` to the folder `target` as PNG, no side above `max_side` px, turned as their EXIF tag says.
+
+    Times are those of the EXIF tags where all photographs have one and not all are equal, else their numbers; the
+    second value names which. Raises `CaptureError` naming a file that cannot be read.
+    """
+    frames, taken = [], []
+    for index, photo in enumerate(photos):
+        image, time = _read(photo, max_side)
+        pixels = np.asarray(image.get_pixels(oiio.FLOAT))
+        rgb = np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
+        luma = (rgb @ np.array([0.299, 0.587, 0.114], np.float32) * 255).clip(0, 255).astype(np.uint8)
+        step = max(1, luma.shape[1] // WIDTH)
+        name = f"{index:05d}.png"
+        write_bytes(target / name, encode_image(rgb, "png", png_level=PNG_LEVEL))
+        frames.append(FootageFrame(name=name, time=float(index), sharpness=sharpness(luma[::step, ::step])))
+        taken.append(time)
+        observe(index + 1, len(photos))
+    known = [time for time in taken if time is not None]
+    if len(known) < len(taken) or len(set(known)) < 2:
+        return tuple(frames), ("the photographs have no times of their own: their order by name is taken as time",)
+    frames = [frame.model_copy(update={"time": t - min(known)}) for frame, t in zip(frames, known, strict=True)]
+    return tuple(sorted(frames, key=lambda frame: frame.time)), ("times are those of the EXIF tags",)
+
+
+def _read(photo: Path, max_side: int) -> tuple[oiio.ImageBuf, float | None]:
+    """The upright image at its final size, and its EXIF time in seconds."""
+    image = oiio.ImageBuf(str(photo))
+    if not image.read(convert=oiio.FLOAT):
+        remedy = "Convert it to JPEG or PNG, or remove it."
+        raise CaptureError(f"cannot be read as an image ({image.geterror()})", file=photo, remedy=remedy)
+    time = _time(image.spec())
+    image = oiio.ImageBufAlgo.reorient(image)
+    spec = image.spec()
+    scale = max_side / max(spec.width, spec.height)
+    if scale < 1:
+        roi = oiio.ROI(0, max(1, round(spec.width * scale)), 0, max(1, round(spec.height * scale)))
+        image = oiio.ImageBufAlgo.resize(image, roi=roi)
+    return image, time
+
+
+def _time(spec: oiio.ImageSpec) -> float | None:
+    text = spec.getattribute("Exif:DateTimeOriginal") or spec.getattribute("DateTime")
+    if not text:
+        return None
+    try:
+        moment = datetime.datetime.strptime(str(text), "%Y:%m:%d %H:%M:%S").replace(tzinfo=datetime.UTC)
+    except ValueError:
+        return None  # a tag that some programs leave empty or write in words
+    fraction = str(spec.getattribute("Exif:SubsecTimeOriginal") or "").strip()
+    return moment.timestamp() + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)

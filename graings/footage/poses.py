@@ -1,0 +1,109 @@
+"""Camera poses of frames by structure from motion: pycolmap's SIFT, matching of near frames and loops, global mapping.
+
+One camera with one radial coefficient took all frames. Features and matches lie in a database in the workspace, so an
+interrupted call continues. Global mapping solves all poses at once: incremental mapping took as long or longer on the
+clips tried, and broke some of them into pieces.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from graings.errors import CaptureError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MAX_FEATURES: Final = 4096
+CAMERA_MODEL: Final = "SIMPLE_RADIAL"
+
+# Each frame is matched with so many following ones, with some further ones at growing distance, and every LOOP_PERIODth
+# frame with all others of these, so that a camera that comes back closes the loop.
+OVERLAP: Final = 5
+FAR: Final = (8, 16, 32)
+LOOP_PERIOD: Final = 8
+
+FEATURES_AT_ONCE: Final = 8
+PAIRS_AT_ONCE: Final = 64
+SEED: Final = 0
+
+Item = TypeVar("Item")
+Observe = Callable[[str, int, int], None]
+
+
+def reconstruct(
+    images: Path, names: Sequence[str], workspace: Path, threads: int, observe: Observe
+) -> pycolmap.Reconstruction | None:
+    """The reconstruction with the most of the images `names` in the folder `images`; None where nothing fits together.
+
+    `observe` is called with the phase, what is done of it and its total. Raises `CaptureError` without pycolmap.
+    """
+    try:
+        import pycolmap  # optional extra [colmap]
+    except ModuleNotFoundError as error:
+        remedy = "Install it: pip install 'graings[colmap]'."
+        raise CaptureError("finding the cameras needs the package pycolmap", file=images, remedy=remedy) from error
+    database = workspace / "database.db"
+    _extract(database, images, names, threads, observe)
+    _match(database, names, workspace / "pairs.txt", threads, observe)
+    observe("mapping", 0, 1)
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = threads
+    options.random_seed = SEED
+    sparse = workspace / "sparse"
+    sparse.mkdir(exist_ok=True)
+    models = pycolmap.global_mapping(database, images, sparse, options).values()
+    observe("mapping", 1, 1)
+    best: pycolmap.Reconstruction | None = max(models, key=lambda model: model.num_reg_images(), default=None)
+    return best
+
+
+def pairs(count: int) -> list[tuple[int, int]]:
+    """The pairs of `count` frames in order of time that are matched."""
+    near = ((i, i + d) for i in range(count) for d in (*range(1, OVERLAP + 1), *FAR) if i + d < count)
+    loops = itertools.combinations(range(0, count, LOOP_PERIOD), 2)
+    return sorted({*near, *loops})
+
+
+def _extract(database: Path, images: Path, names: Sequence[str], threads: int, observe: Observe) -> None:
+    import pycolmap
+
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = threads
+    options.sift.max_num_features = MAX_FEATURES
+    options.sift.first_octave = 0  # not doubled first: a third of the time, and as many frames registered
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = CAMERA_MODEL
+    done = 0
+    for chunk in _chunks(names, FEATURES_AT_ONCE):
+        if database.exists():
+            reader.existing_camera_id = 1
+        pycolmap.extract_features(
+            database, images, list(chunk), pycolmap.CameraMode.SINGLE, reader, options, pycolmap.Device.cpu
+        )
+        done += len(chunk)
+        observe("features", done, len(names))
+
+
+def _match(database: Path, names: Sequence[str], listing: Path, threads: int, observe: Observe) -> None:
+    import pycolmap
+
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = threads
+    chosen = pairs(len(names))
+    done = 0
+    for chunk in _chunks(chosen, PAIRS_AT_ONCE):
+        listing.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in chunk))
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = listing
+        pycolmap.match_image_pairs(database, options, pairing, pycolmap.TwoViewGeometryOptions(), pycolmap.Device.cpu)
+        done += len(chunk)
+        observe("matching", done, len(chosen))
+
+
+def _chunks(items: Sequence[Item], size: int) -> Iterator[Sequence[Item]]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
