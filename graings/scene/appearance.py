@@ -161,6 +161,12 @@ class ResidualPart:
     time_only: GroupBias
     seeing: GroupBias | None
 
+    def of_anchors(self, first: int, last: int) -> ResidualPart:
+        """The part of the anchors from `first` to before `last`."""
+        parts = [None if part is None else _per_row(part.values[first:last]) for part in (self.time_only, self.seeing)]
+        assert parts[0] is not None
+        return ResidualPart(parts[0], parts[1])
+
 
 class ResidualField(TemporalHead):
     """F_res of Eq. 12: (f_a, gamma(t)) -> (Delta c, Delta o) per child slot; zero at initialization.

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from numpy.typing import ArrayLike
 from torch import Tensor
 
@@ -90,6 +90,41 @@ class PreparedScene:
         instant = self.children * (4 * 8 + 11 * 4) + slots * 4 * 4
         return sum(t.numel() * t.element_size() for t in tensors) + self._kept_times * instant
 
+    @property
+    def slots(self) -> Int64[Tensor, " child"]:
+        """Flat slots (anchor * k + child) of these children in the scene, ascending."""
+        return self._candidates.children
+
+    @property
+    def uids(self) -> Int64[Tensor, " child"]:
+        """Persistent numbers of these children."""
+        return self._candidates.uids
+
+    @torch.inference_mode()
+    def geometry(self, time: float, rows: Int64[Tensor, " row"]) -> Geometry:
+        """Means, quaternions and log-scales of the children `rows` (ascending) at `time`, shown there or not."""
+        return self._geometry.at(time, rows)
+
+    @torch.inference_mode()
+    def residual(self, time: float, eye: ArrayLike, rows: Int64[Tensor, " row"]) -> Float[Tensor, "row 4"]:
+        """(Delta c, Delta o) of Eq. 12 of the children `rows` (ascending) at `time` from `eye`; 0 without residual."""
+        return self._appearance.residual(time, eye, self._candidates.slots.index_select(0, rows))
+
+    @property
+    def residual_depends_on_view(self) -> bool:
+        """Whether Delta c of `residual` depends on the eye."""
+        return self._appearance.residual_depends_on_view
+
+    @torch.inference_mode()
+    def canonical_opacities(self, eye: ArrayLike) -> Float[Tensor, " child"]:
+        """o_can of Eq. 11 of all these children; `eye` counts with `opacity_view` only."""
+        return self._opacities_from(eye).flatten().index_select(0, self._candidates.slots)
+
+    @torch.inference_mode()
+    def canonical_colors(self, eye: ArrayLike) -> Float[Tensor, "child 3"]:
+        """c_can of Eq. 11 of all these children."""
+        return self._appearance.colors(eye, self._candidates.slots, None)
+
     @torch.inference_mode()
     def compose(self, eye: ArrayLike, time: float) -> Composed:
         """The Gaussians at `time` in [0, 1] for the camera centre `eye` [3] (normalised units)."""
@@ -111,8 +146,7 @@ class PreparedScene:
 
     def _instant(self, eye: ArrayLike, time: float) -> _Instant:
         if self._opacities is None:  # opacities, and with them the choice of children, depend on the view
-            anchors = self.scene.directions(eye).index_select(0, self._anchors)
-            return self._instant_with(self._canonical_opacities(anchors), time)
+            return self._instant_with(self._opacities_from(eye), time)
         with self._guard:
             known = self._instants.get(time)
             if known is not None:
@@ -129,6 +163,11 @@ class PreparedScene:
         """The instant with these canonical `opacities`."""
         rendered, changes = self._appearance.rendered(self._candidates, opacities, time)
         return _Instant(rendered, self._geometry.at(time, rendered.rows), changes)
+
+    def _opacities_from(self, eye: ArrayLike) -> Float[Tensor, "anchor child"]:
+        if self._opacities is not None:
+            return self._opacities
+        return self._canonical_opacities(self.scene.directions(eye).index_select(0, self._anchors))
 
     def _canonical_opacities(self, directions: Float[Tensor, "anchor 3"]) -> Float[Tensor, "anchor child"]:
         """o_can (Eq. 11) of every slot of the kept anchors; `directions` count with `opacity_view` only."""

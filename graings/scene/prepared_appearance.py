@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from graings import constants, kernel
-from graings.scene.appearance import TemporalHead
-from graings.scene.encoding import direction_width
+from graings.scene.appearance import ResidualPart, TemporalHead
+from graings.scene.encoding import direction_width, directions_from
 from graings.scene.perceptron import GroupBias
 from graings.scene.scene import Scene
 
@@ -63,14 +63,16 @@ class PreparedAppearance:
         self, scene: Scene, anchors: Int64[Tensor, " anchor"], features: Float[Tensor, "anchor feature"]
     ) -> None:
         self._positions = scene.scaffold.anchors.index_select(0, anchors)
+        self._slots = scene.scaffold.slots
         part = scene.appearance.color_part(features)
         layers = map(_contiguous, scene.appearance.color_layers(part))
         self._canonical = (part.normals, scene.appearance.color_sh_degree, part.hidden.values, *layers)
         self._residual = scene.residual if scene.temporal else None
+        self._part: ResidualPart | None = None
         self._time_only: _Head | None = None
         self._seeing: _Head | None = None
         if self._residual is not None:
-            parts = self._residual.part(features)
+            parts = self._part = self._residual.part(features)
             self._time_only = _Head(self._residual, parts.time_only, 0)
             if self._residual.seeing is not None and parts.seeing is not None:
                 others = direction_width(self._residual.sh_degree)
@@ -81,6 +83,21 @@ class PreparedAppearance:
         heads = [head for head in (self._time_only, self._seeing) if head is not None]
         canonical = [part for part in self._canonical if isinstance(part, Tensor)]
         return (self._positions, *canonical, *(head.hidden for head in heads))
+
+    @property
+    def residual_depends_on_view(self) -> bool:
+        """Whether Delta c of Eq. 12 receives the viewing direction."""
+        return self._seeing is not None
+
+    def residual(self, time: float, eye: ArrayLike, slots: Int64[Tensor, " child"]) -> Float[Tensor, "child 4"]:
+        """(Delta c, Delta o) of Eq. 12 of the ascending `slots` of these anchors."""
+        if self._residual is None or self._part is None or not len(slots):
+            return self._positions.new_zeros(len(slots), 4)
+        count = self._slots
+        first, last = int(slots[0]) // count, int(slots[-1]) // count + 1
+        part, times = self._part.of_anchors(first, last), self._positions.new_tensor([time])
+        raw = self._residual(part, times, directions_from(eye, self._positions[first:last]))
+        return self._residual.bounded(raw.flatten(0, 1).index_select(0, slots - first * count))
 
     def rendered(
         self, candidates: Candidates, opacities: Float[Tensor, "anchor child"], time: float
