@@ -20,13 +20,14 @@ from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from graings.scene.prepared import PreparedScene as PreparedScene  # part of this module's interface too
 from graings.scene.scene import Composed, Scene
+from graings.scene.splats import Splats
 
 # Upper bound of the supersampled image: four pixels for each of 1920 x 1080, in 200 MB.
 MAX_SUPERSAMPLED_PIXELS: Final = 1 << 23
 
 
 def render(
-    scene: Scene | PreparedScene,
+    scene: Scene | PreparedScene | Splats,
     camera: Camera,
     time: float,
     background: Sequence[float],

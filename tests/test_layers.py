@@ -35,6 +35,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.plan": ("graings.capture", "graings.config"),
     "graings.evaluation": ("graings.capture", "graings.render", "graings.scene"),
     "graings.storage": ("graings.camera", "graings.config", "graings.scene"),
+    "graings.export": ("graings.camera", "graings.render", "graings.scene", "graings.storage"),
     "graings.report": (
         *(
             "graings.camera",
@@ -60,8 +61,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
-        *("graings.footage", "graings.kernel", "graings.plan", "graings.render", "graings.report", "graings.storage"),
-        "graings.training",
+        *("graings.export", "graings.footage", "graings.kernel", "graings.plan", "graings.render", "graings.report"),
+        *("graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
     "jobs": (
@@ -71,8 +72,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
     # HTTP never trains.
     "service": (
-        *("graings.camera", "graings.capture", "graings.config", "graings.kernel", "graings.plan", "graings.render"),
-        *("graings.report", "graings.storage", "jobs"),
+        *("graings.camera", "graings.capture", "graings.config", "graings.export", "graings.kernel", "graings.plan"),
+        *("graings.render", "graings.report", "graings.storage", "jobs"),
     ),
 }
 
