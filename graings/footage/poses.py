@@ -46,6 +46,7 @@ def reconstruct(
     except ModuleNotFoundError as error:
         remedy = "Install it: pip install 'graings[colmap]'."
         raise CaptureError("finding the cameras needs the package pycolmap", file=images, remedy=remedy) from error
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     database = workspace / "database.db"
     _extract(database, images, names, threads, observe)
     _match(database, names, workspace / "pairs.txt", threads, observe)

@@ -24,6 +24,9 @@ HDR_TRANSFERS: Final = {16: "PQ", 18: "HLG"}
 
 PNG_LEVEL: Final = 1
 
+# Of an interval: a frame exactly at its start must not fall into the one before.
+ROUNDING: Final = 1e-6
+
 
 @dataclass(slots=True)
 class _Candidate:
@@ -80,7 +83,7 @@ def _extract(
             _refuse_hdr(frame, video)
         seen += 1
         time = frame.time - start
-        current = min(int(time / duration * count), count - 1)
+        current = min(int(time / duration * count + ROUNDING), count - 1)
         if best is not None and current != interval:
             written.append(_write(best, target, len(written), max_side))
             observe(current, count)

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from graings.errors import CaptureError
+from graings.footage.photos import convert_photographs, photographs
+from tests.footage.clips import read_png
+
+
+def write(path: Path, pixels: np.ndarray, **attributes: object) -> None:
+    image = oiio.ImageBuf(oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.UINT8))
+    for key, value in attributes.items():
+        image.specmod().attribute(key.replace("__", ":"), value)
+    image.set_pixels(oiio.ROI(), pixels.astype(np.float32) / 255)
+    assert image.write(str(path)), image.geterror()
+
+
+def convert(folder: Path, max_side: int = 64):  # type: ignore[no-untyped-def]
+    target = folder / "out"
+    target.mkdir()
+    return convert_photographs(photographs(folder), target, max_side, lambda done, total: None)
+
+
+def test_photographs_without_times_are_numbered_in_order_of_their_names(tmp_path: Path) -> None:
+    for name in ("b.jpg", "a.png", "c.webp"):
+        write(tmp_path / name, np.full((20, 30, 3), 90, np.uint8))
+    (tmp_path / "notes.txt").write_text("no image")
+    frames, notes = convert(tmp_path)
+    assert [(frame.name, frame.time) for frame in frames] == [("00000.png", 0), ("00001.png", 1), ("00002.png", 2)]
+    assert "order by name" in notes[0]
+
+
+def test_times_of_the_exif_tags_order_the_frames(tmp_path: Path) -> None:
+    for name, second in (("a.jpg", 30), ("b.jpg", 10), ("c.jpg", 20)):
+        moment = f"2026:11:28 10:00:{second}"
+        write(tmp_path / name, np.full((20, 30, 3), 90, np.uint8), Exif__DateTimeOriginal=moment)
+    frames, notes = convert(tmp_path)
+    assert [(frame.name, frame.time) for frame in frames] == [("00001.png", 0), ("00002.png", 10), ("00000.png", 20)]
+    assert "EXIF" in notes[0]
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_orientation_tag_is_applied(tmp_path: Path, orientation: int) -> None:
+    upright = np.zeros((20, 30, 3), np.uint8)
+    upright[:10, :15] = 255  # bright at the top left
+    stored = np.rot90(upright, {1: 0, 3: 2, 6: 1, 8: 3}[orientation])
+    write(tmp_path / "a.jpg", np.ascontiguousarray(stored), Orientation=orientation)
+    convert(tmp_path)
+    image = read_png(tmp_path / "out" / "00000.png")
+    assert image.shape[:2] == (20, 30)
+    assert image[:8, :12, :3].mean() > 0.9
+    assert image[12:, 18:, :3].mean() < 0.1
+
+
+def test_large_photographs_are_reduced(tmp_path: Path) -> None:
+    write(tmp_path / "a.jpg", np.full((200, 100, 3), 60, np.uint8))
+    convert(tmp_path, max_side=64)
+    assert read_png(tmp_path / "out" / "00000.png").shape[:2] == (64, 32)
+
+
+def test_a_photograph_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 not a photograph")
+    with pytest.raises(CaptureError, match=r"broken\.jpg"):
+        convert(tmp_path)
