@@ -11,6 +11,7 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from graings.ablation.experiment import Ablation
+from graings.footage.report import FootageCamera, FootageReport
 from graings.report import events
 from graings.report.events import Event, Grew, StepSkipped
 from graings.report.folder import report_runs
@@ -46,6 +47,24 @@ EVENTS: tuple[Event, ...] = (
 REPORT = ProgressReport(phase="joint", iteration=202, iterations=500, attempt=1, loss=0.1, events=EVENTS)
 
 
+FOOTAGE = FootageReport(
+    source="clip.mp4",
+    seen=900,
+    taken=99,
+    registered=98,
+    left_out=("00007.png",),
+    blurred=("00009.png",),
+    points=2_000,
+    reprojection_error=0.5,
+    track_length=12.5,
+    parallax=9.0,
+    path_over_depth=0.8,
+    duration=30.0,
+    camera=FootageCamera(width=640, height=480, focal=600.0, field_of_view=56.0, distortion=-0.05),
+    seconds={"frames": 2.0},
+)
+
+
 def validator(name: str) -> Draft202012Validator:
     schema = json.loads((ROOT / "docs" / "schemas" / f"{name}.json").read_text())
     Draft202012Validator.check_schema(schema)
@@ -73,6 +92,7 @@ def documents(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         "plan": read["run"]["plan"],
         "progress": json.loads(REPORT.model_dump_json()),
         "event": EVENTS[0].to_json(),
+        "footage": FOOTAGE.to_json(),
     }
 
 
