@@ -20,7 +20,7 @@ import numpy as np
 from graings.camera.camera import Camera
 from graings.errors import CheckpointError
 from graings.image_encoding import ImageFormat, encode_image
-from graings.render import PreparedScene, render
+from graings.render import MotionBasisReport, PreparedScene, fast_scene, render
 from graings.storage.compact import open_model
 from graings.storage.model import Model, scene_bytes
 from graings.storage.run_folder import newest_model
@@ -33,25 +33,38 @@ NICE = 5
 
 @dataclass(frozen=True, slots=True)
 class RenderRequest:
-    """Everything an image depends on, except the model. `time` is in [0, 1], `background` is RGB in [0, 1]."""
+    """Everything an image depends on, except the model. `time` is in [0, 1], `background` is RGB in [0, 1].
+
+    `fast` approximates the motion (`graings.render.fast_scene`).
+    """
 
     camera: Camera
     time: float
     background: tuple[float, float, float]
     format: ImageFormat
+    fast: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class LoadedModel:
-    """A model in memory, prepared for rendering."""
+    """A model in memory, prepared for rendering; for fast images when the first of them is asked for."""
 
-    model: Model
-    scene: PreparedScene
+    def __init__(self, model: Model, scene: PreparedScene) -> None:
+        self.model, self.scene = model, scene
+        self._fast: tuple[PreparedScene, MotionBasisReport] | None = None
+        self._guard = threading.Lock()
 
     @property
     def bytes(self) -> int:
         """Memory that it takes."""
-        return scene_bytes(self.model.scene) + self.scene.bytes
+        fast = 0 if self._fast is None else self._fast[0].bytes
+        return scene_bytes(self.model.scene) + self.scene.bytes + fast
+
+    def fast(self) -> tuple[PreparedScene, MotionBasisReport]:
+        """The scene of fast images and its error. The first call takes seconds; may be called from several threads."""
+        with self._guard:
+            if self._fast is None:
+                self._fast = fast_scene(self.scene, self.model.views.get("train", ()))
+            return self._fast
 
 
 class ModelCache:
@@ -150,7 +163,8 @@ def _lower_priority() -> None:
 
 
 def _rendered(loaded: LoadedModel, request: RenderRequest) -> bytes:
-    result = render(loaded.scene, request.camera, request.time, request.background)
+    scene = loaded.fast()[0] if request.fast else loaded.scene
+    result = render(scene, request.camera, request.time, request.background)
     return encode_image(np.asarray(result.color, dtype=np.float32), request.format)
 
 

@@ -24,6 +24,7 @@ REACH: Final = math.sqrt(-2.0 * math.log(constants.ALPHA_MIN))
 # Training views that pixels are measured in, and eyes that the residual is averaged over: evenly chosen.
 MOST_VIEWS: Final = 100
 MOST_EYES: Final = 4
+CHECKED_VIEWS: Final = 12  # that the average is compared with
 
 
 def chosen(views: Sequence[View], most: int) -> list[View]:
@@ -149,6 +150,18 @@ class ResidualSignal(TimeSignal):
     ) -> Float[Tensor, " row"]:
         largest: Tensor = (found - expected).abs().amax(-1)
         return largest
+
+    def view_errors(self, views: Sequence[View]) -> Float[Tensor, "view child"]:
+        """How far the colour that each of some `views` has at its time is from the mean over eyes."""
+        rows = torch.arange(self._prepared.children)
+        if len(self.eyes) == 1 or not len(rows):
+            return self.state.new_zeros(0, len(rows))
+        found = []
+        for view in chosen(views, CHECKED_VIEWS):
+            mean = self.at(view.time, rows) + self.state
+            seen = self._prepared.residual(view.time, view.camera.center, rows)
+            found.append((seen - mean)[:, :3].abs().amax(-1))
+        return torch.stack(found)
 
 
 def _unit(rotations: Float[Tensor, "row 4"]) -> Float[Tensor, "row 4"]:

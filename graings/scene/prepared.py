@@ -16,6 +16,7 @@ o_can over all directions takes its place, enlarged by a bound of the rounding o
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -30,8 +31,8 @@ from graings import constants
 from graings.gaussians import Gaussians
 from graings.scene.activations import tanh
 from graings.scene.children import Geometry
-from graings.scene.prepared_appearance import Candidates, Changes, PreparedAppearance, Rendered
-from graings.scene.prepared_geometry import prepared_geometry
+from graings.scene.prepared_appearance import BasisResidual, Candidates, Changes, PreparedAppearance, Rendered
+from graings.scene.prepared_geometry import PreparedGeometry, prepared_geometry
 from graings.scene.scene import Composed, Scene
 
 # Times of which geometry and opacities are kept: players show one time from many views, or a few times again.
@@ -74,6 +75,14 @@ class PreparedScene:
         self._kept_times = kept_times
         self._instants: OrderedDict[float, _Instant] = OrderedDict()
         self._guard = threading.Lock()
+
+    def with_basis(self, geometry: PreparedGeometry, residual: BasisResidual) -> PreparedScene:
+        """The same scene with another way of evaluating time; what does not depend on time is shared."""
+        other = copy.copy(self)
+        other._geometry = geometry
+        other._appearance = self._appearance.with_basis(residual)
+        other._instants, other._guard = OrderedDict(), threading.Lock()
+        return other
 
     @property
     def children(self) -> int:

@@ -42,6 +42,10 @@ _IMAGES: dict[int | str, dict[str, Any]] = {
                 "schema": {"type": "string"},
                 "description": "azimuth elevation radius of an orbit.",
             },
+            "X-Graings-Fast": {
+                "schema": {"type": "string"},
+                "description": "With fast: how far the approximation is from exact, in px and grey levels.",
+            },
             "X-Time-Clamped": {
                 "schema": {"type": "number"},
                 "description": "The rendered time, if t was outside [0, 1].",
@@ -86,6 +90,10 @@ class RenderQuery(BaseModel):
     height: int | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels.")
     background: str | None = Field(None, max_length=60, description="white, black, #rrggbb or r,g,b in [0, 1].")
     format: ImageFormat | None = Field(None, description="Instead of the Accept header.")
+    fast: bool = Field(
+        False,
+        description="Approximate the motion; X-Graings-Fast says by how much. The first such image takes seconds.",
+    )
 
 
 @router.get("/render", operation_id="render", response_class=Response, responses={**_IMAGES, **RESPONSES})
@@ -104,7 +112,7 @@ async def render(
         camera, time, background = view.resolve(model.views, model.units, model.background)
     except ValueError as error:
         raise BadRequest(f"{error}.") from error
-    request = RenderRequest(camera, time, background, format)
+    request = RenderRequest(camera, time, background, format, query.fast)
     headers = {
         "ETag": _etag(model, request),
         "Vary": "Accept",
@@ -121,6 +129,8 @@ async def render(
     if _matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     image = await context.pool.render(loaded, request, headers["ETag"])
+    if request.fast:
+        headers["X-Graings-Fast"] = (await to_thread.run_sync(loaded.fast))[1].line
     return Response(image, media_type=MEDIA_TYPES[format], headers=headers)
 
 
@@ -212,7 +222,7 @@ def _etag(model: Model, request: RenderRequest) -> str:
         model.digest,
         camera.world_to_camera.tolist(),
         (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
-        (request.time, request.background, request.format),
+        (request.time, request.background, request.format, request.fast),
     )
     return f'"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}"'
 

@@ -18,7 +18,7 @@ from graings.camera.camera import Camera
 from graings.camera.view_request import MAX_SIDE
 from graings.camera.viewpoint import orbit_view
 from graings.image_encoding import encode_image
-from graings.render import PreparedScene, render
+from graings.render import PreparedScene, fast_scene, render
 from graings.storage.checkpoint import load_model
 from jobs.store import JobFolder
 from service.rendering import LoadedModel, ModelCache, RenderPool, RenderRequest
@@ -44,6 +44,20 @@ def test_a_view_of_the_capture_is_what_the_library_renders(client: TestClient, m
     assert answer.headers["x-graings-job"] == model
     assert answer.headers["x-graings-iteration"] == str(ITERATIONS)
     assert answer.headers["x-graings-finished"] == "true"
+
+
+def test_a_fast_image_is_that_of_the_approximated_scene(client: TestClient, model: str, trained: Path) -> None:
+    view = {"t": 0.37, "camera": "val:1"}
+    exact, fast = (client.get("/render", params={**view, "fast": fast}) for fast in (False, True))
+    loaded = load_model(trained)
+    scene, report = fast_scene(PreparedScene(loaded.scene), loaded.views["train"])
+    expected = render(scene, loaded.views["val"][1].camera, 0.37, loaded.background)
+    assert fast.content == encode_image(expected.color.numpy(), "png")
+    assert fast.headers["x-graings-fast"] == report.line
+    assert "x-graings-fast" not in exact.headers
+    assert exact.content == client.get("/render", params=view).content
+    assert exact.headers["etag"] != fast.headers["etag"]
+    assert client.get("/render", params={**view, "fast": "quick"}).status_code == 422
 
 
 def test_an_orbit_takes_its_defaults_from_the_capture(client: TestClient, model: str, trained: Path) -> None:
