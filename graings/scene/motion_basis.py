@@ -38,6 +38,10 @@ from graings.scene.time_basis import TimeBasis, between, fit, quantile
 PLAYER_PIXELS: Final = 0.5
 LEVELS: Final = 1.0
 
+# Errors of single Gaussians average out where several are blended: with this, images differ by half a grey level RMS
+# (docs/experiments/serving.md).
+VIEW_LEVELS: Final = 4.0
+
 # Times at which functions are learned; as many between them are checked. At least SAMPLES_PER_PERIOD of the shortest
 # period that the networks' encoding of time has.
 LEAST_TIMES: Final = 64
@@ -72,10 +76,11 @@ class MotionBasis:
             + self.residual.bytes
         )
 
-    def prepared(self, exact: PreparedScene) -> PreparedScene:
+    def prepared(self, exact: PreparedScene, *, view_levels: float = VIEW_LEVELS) -> PreparedScene:
         """`exact`, the scene that this is the basis of, with motion and residual from the basis.
 
-        The residual's colours remain exact where they depend on the view by more than the bound.
+        The residual's colours remain exact where averaging them over views changes more than 1 % of them by more than
+        `view_levels` of 255.
         """
         dtype = exact.scene.extent.dtype
         states = [state.to(dtype) for state in (self.means, self.quats, self.log_scales)]
@@ -83,7 +88,7 @@ class MotionBasis:
         seen = self.report.residual_of_views
         return exact.with_basis(
             BasisGeometry(self.geometry, *states),
-            BasisResidual(self.residual, residual, exact_colors=seen.p99 > self.report.residual.bound),
+            BasisResidual(self.residual, residual, exact_colors=seen.p99 > view_levels),
         )
 
     def geometry_at(self, time: float) -> Geometry:

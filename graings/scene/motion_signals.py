@@ -129,7 +129,7 @@ class ResidualSignal(TimeSignal):
         most = MOST_EYES if prepared.residual_depends_on_view else 1
         self.eyes = [view.camera.center for view in chosen(views, most)] or [np.zeros(3)]
         everything = torch.arange(prepared.children)
-        first = prepared.residual(times[0], self.eyes[0], everything[:1])
+        first = prepared.residual(times[0], self.eyes, everything[:1])
         self.child_scales = first.new_ones(prepared.children)
         self.value_scales = first.new_ones(4)
         self.state = first.new_zeros(prepared.children, 4)
@@ -142,8 +142,7 @@ class ResidualSignal(TimeSignal):
         self.rest_errors = rest[~self.moving]
 
     def at(self, time: float, rows: Int64[Tensor, " row"]) -> Float[Tensor, "row 4"]:
-        seen = [self._prepared.residual(time, eye, rows) for eye in self.eyes]
-        return torch.stack(seen).mean(0) - self.state[rows]
+        return self._prepared.residual(time, self.eyes, rows) - self.state[rows]
 
     def errors(
         self, rows: Int64[Tensor, " row"], found: Float[Tensor, "row 4"], expected: Float[Tensor, "row 4"]
@@ -159,7 +158,7 @@ class ResidualSignal(TimeSignal):
         found = []
         for view in chosen(views, CHECKED_VIEWS):
             mean = self.at(view.time, rows) + self.state
-            seen = self._prepared.residual(view.time, view.camera.center, rows)
+            seen = self._prepared.residual(view.time, [view.camera.center], rows)
             found.append((seen - mean)[:, :3].abs().amax(-1))
         return torch.stack(found)
 

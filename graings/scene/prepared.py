@@ -19,6 +19,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -115,9 +116,9 @@ class PreparedScene:
         return self._geometry.at(time, rows)
 
     @torch.inference_mode()
-    def residual(self, time: float, eye: ArrayLike, rows: Int64[Tensor, " row"]) -> Float[Tensor, "row 4"]:
-        """(Delta c, Delta o) of Eq. 12 of the children `rows` (ascending) at `time` from `eye`; 0 without residual."""
-        return self._appearance.residual(time, eye, self._candidates.slots.index_select(0, rows))
+    def residual(self, time: float, eyes: Sequence[ArrayLike], rows: Int64[Tensor, " row"]) -> Float[Tensor, "row 4"]:
+        """(Delta c, Delta o) of Eq. 12 of the children `rows` (ascending) at `time`, the mean over `eyes`; else 0."""
+        return self._appearance.residual(time, eyes, self._candidates.slots.index_select(0, rows))
 
     @property
     def residual_depends_on_view(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -125,15 +125,18 @@ class PreparedAppearance:
         """Whether Delta c of Eq. 12 receives the viewing direction."""
         return self._seeing is not None
 
-    def residual(self, time: float, eye: ArrayLike, slots: Int64[Tensor, " child"]) -> Float[Tensor, "child 4"]:
-        """(Delta c, Delta o) of Eq. 12 of the ascending `slots` of these anchors."""
+    def residual(
+        self, time: float, eyes: Sequence[ArrayLike], slots: Int64[Tensor, " child"]
+    ) -> Float[Tensor, "child 4"]:
+        """(Delta c, Delta o) of Eq. 12 of the ascending `slots` of these anchors, the mean over `eyes`."""
         if self._residual is None or self._part is None or not len(slots):
             return self._positions.new_zeros(len(slots), 4)
-        count = self._slots
-        first, last = int(slots[0]) // count, int(slots[-1]) // count + 1
-        part, times = self._part.of_anchors(first, last), self._positions.new_tensor([time])
-        raw = self._residual(part, times, directions_from(eye, self._positions[first:last]))
-        return self._residual.bounded(raw.flatten(0, 1).index_select(0, slots - first * count))
+        first, last = int(slots[0]) // self._slots, int(slots[-1]) // self._slots + 1
+        directions = [directions_from(eye, self._positions[first:last]) for eye in eyes]
+        raw = self._residual.of_directions(
+            self._part.of_anchors(first, last), self._positions.new_tensor([time]), directions
+        )
+        return self._residual.bounded(raw.flatten(1, 2).index_select(1, slots - first * self._slots)).mean(0)
 
     def rendered(
         self, candidates: Candidates, opacities: Float[Tensor, "anchor child"], time: float

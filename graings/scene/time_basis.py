@@ -21,7 +21,7 @@ from graings.scene.child_blocks import ActiveUnits
 
 # Children that the functions are learned from, evenly chosen; weights are then found for all.
 LEARNED_FROM: Final = 4096
-CHILDREN_AT_ONCE: Final = 8192
+CHILDREN_AT_ONCE: Final = 16384
 MOST_SAMPLES: Final = 1025  # of each function of time
 QUANTILE: Final = 0.99  # of the errors of children and instants: what the bound holds for
 # Share of the bound that the rank may use; the rest is for the interpolation between samples.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Mapping
+from time import perf_counter
 from typing import Annotated, Any
 
 import numpy as np
@@ -45,6 +47,10 @@ _IMAGES: dict[int | str, dict[str, Any]] = {
             "X-Graings-Fast": {
                 "schema": {"type": "string"},
                 "description": "With fast: how far the approximation is from exact, in px and grey levels.",
+            },
+            "Server-Timing": {
+                "schema": {"type": "string"},
+                "description": "Milliseconds of request, queue, scene, raster and encode; a kept image has the first.",
             },
             "X-Time-Clamped": {
                 "schema": {"type": "number"},
@@ -104,6 +110,7 @@ async def render(
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """Render the newest model, or a job's newest checkpoint while it trains, at time `t` from a viewpoint."""
+    started = perf_counter()
     format = query.format or _format(accept)
     job_id, loaded = await to_thread.run_sync(_model, context, query.job)
     model = loaded.model
@@ -128,10 +135,17 @@ async def render(
         headers["X-Graings-Orbit"] = _orbit_header(view, camera, model.units)
     if _matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
+    resolved = perf_counter()
     image = await context.pool.render(loaded, request, headers["ETag"])
     if request.fast:
         headers["X-Graings-Fast"] = (await to_thread.run_sync(loaded.fast))[1].line
-    return Response(image, media_type=MEDIA_TYPES[format], headers=headers)
+    headers["Server-Timing"] = _server_timing({"request": resolved - started, **image.seconds})
+    return Response(image.data, media_type=MEDIA_TYPES[format], headers=headers)
+
+
+def _server_timing(seconds: Mapping[str, float]) -> str:
+    """Milliseconds of each step, in order, as browsers show them."""
+    return ", ".join(f"{name};dur={1e3 * duration:.2f}" for name, duration in seconds.items())
 
 
 def _format(accept: str | None) -> ImageFormat:

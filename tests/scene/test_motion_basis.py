@@ -222,7 +222,7 @@ def test_the_residual_that_depends_on_the_view_is_its_mean_over_eyes() -> None:
     signal = ResidualSignal(prepared, VIEWS, times, 1e-4)
     assert len(signal.eyes) > 1
     rows = torch.arange(prepared.children)
-    mean = torch.stack([prepared.residual(0.3, eye, rows) for eye in signal.eyes]).mean(0)
+    mean = torch.stack([prepared.residual(0.3, [eye], rows) for eye in signal.eyes]).mean(0)
     torch.testing.assert_close(signal.at(0.3, rows) + signal.state, mean, rtol=0, atol=1e-6)
 
 
@@ -240,7 +240,7 @@ def test_fitting_no_children_gives_no_functions() -> None:
 def test_the_fast_scene_shows_what_the_basis_says(config: dict[str, Any]) -> None:
     exact = PreparedScene(scene_of(config))
     basis = MotionBasis.of(exact, VIEWS, pixels=0.2, levels=255.0)  # which also averages colours over views
-    fast, eye = basis.prepared(exact), VIEWS[4].camera.center
+    fast, eye = basis.prepared(exact, view_levels=255.0), VIEWS[4].camera.center
     for time in (0.0, 0.31, 1.0):
         residual = basis.residual_at(time)
         shown = residual[:, 3] > constants.ALPHA_MIN
@@ -275,7 +275,7 @@ def test_colours_of_the_residual_stay_exact_where_the_view_counts_more_than_the_
     exact = PreparedScene(scene_of({"residual_sh_degree": 2}))
     basis = MotionBasis.of(exact, VIEWS, levels=0.1)
     assert basis.report.residual_of_views.p99 > 0.1
-    found, expected = basis.prepared(exact).compose(EYE, 0.31), exact.compose(EYE, 0.31)
+    found, expected = basis.prepared(exact, view_levels=0.1).compose(EYE, 0.31), exact.compose(EYE, 0.31)
     both = torch.isin(found.children, expected.children)
     assert torch.equal(
         found.gaussians.colors[both],
