@@ -3,12 +3,13 @@
     python benchmarks/serving.py RUN... [--json FILE] [--px 400 800] [--threads 1 2] [--rounds 40] [--before]
 
 For each model, image size and number of threads, medians in milliseconds of `render` at a time and from a view not seen
-before, of `rasterize` for the Gaussians of that view, of `render` from another view at that time (`orbit_ms`), and of
-the PNG encoding that the service uses. They are timed in turn in one process, so their ratios mean something on a busy
-machine. Other processes disturb a longer call more often: `ratio_cpu` is the ratio of the CPU times, with one thread,
-which do not count what other processes take. `before_ms` (--before) is the path that training uses, `Scene.compose` and
-then `rasterize`; its image must have the same bits. `first_ms` is the first view after a model was read: preparation
-and `render`.
+before, of the same with the motion basis (`fast_ms`), of `rasterize` for the Gaussians of that view, of `render` from
+another view at that time (`orbit_ms`), and of the PNG encoding that the service uses. They are timed in turn in one
+process, so their ratios mean something on a busy machine. Other processes disturb a longer call more often: `ratio_cpu`
+is the ratio of the CPU times, with one thread, which do not count what other processes take. `before_ms` (--before) is
+the path that training uses, `Scene.compose` and then `rasterize`; its image must have the same bits. `first_ms` is the
+first view after a model was read: preparation and `render`. `fast_first_s` is what the motion basis takes beside,
+once for a model.
 
 Lines for the PNG levels follow: size and CPU milliseconds of one image.
 
@@ -39,7 +40,7 @@ from graings.camera.camera import Camera
 from graings.image_encoding import encode_image
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
-from graings.render import low_pass, render, render_composition
+from graings.render import fast_scene, low_pass, render, render_composition
 from graings.scene.prepared import PreparedScene
 from graings.storage.compact import open_model
 from graings.storage.model import Model
@@ -72,7 +73,7 @@ def measured(model: Model, name: str, px: int, threads: int, rounds: int, before
     """One row."""
     views = [view for split in model.views.values() for view in split]
     background = torch.tensor(model.background)
-    first, drawn, raster, orbit, encoded, unprepared = (Times() for _ in range(6))
+    first, drawn, raster, orbit, encoded, unprepared, approximated = (Times() for _ in range(7))
     gaussians = 0
 
     def camera_of(index: int) -> Camera:
@@ -91,6 +92,7 @@ def measured(model: Model, name: str, px: int, threads: int, rounds: int, before
             raster.of(
                 lambda: rasterize(composed.gaussians, camera, background, settings=settings, depth=False), counted
             )
+        approximated.of(lambda: render(fast, camera, moment, model.background), counted)
         orbit.of(lambda: render(prepared, other, moment, model.background), counted)
         encoded.of(lambda: encode_image(np.asarray(image.color), "png"), counted)
         gaussians = max(gaussians, len(composed.gaussians))
@@ -112,6 +114,9 @@ def measured(model: Model, name: str, px: int, threads: int, rounds: int, before
         return scene
 
     prepared = first.of(first_view)
+    started = time.perf_counter()
+    fast, _ = fast_scene(prepared, model.views["train"])
+    fast_first_s = time.perf_counter() - started
     for number in range(-WARM_UPS, rounds):
         one_round(number + WARM_UPS, number >= 0)
     for number in range(-1, rounds // 2 if before else -1):
@@ -124,6 +129,9 @@ def measured(model: Model, name: str, px: int, threads: int, rounds: int, before
         "render_ms": drawn.median,
         "rasterize_ms": raster.median,
         "ratio": drawn.median / raster.median,
+        "fast_ms": approximated.median,
+        "fast_ratio": approximated.median / raster.median,
+        "fast_first_s": fast_first_s,
         "encode_ms": encoded.median,
         "fps": 1e3 / drawn.median,
         "orbit_ms": orbit.median,
@@ -131,6 +139,7 @@ def measured(model: Model, name: str, px: int, threads: int, rounds: int, before
     }
     if threads == 1:
         row["ratio_cpu"] = statistics.median(drawn.cpu) / statistics.median(raster.cpu)
+        row["fast_ratio_cpu"] = statistics.median(approximated.cpu) / statistics.median(raster.cpu)
     if before:
         row |= {"before_ms": unprepared.median, "before_ratio": unprepared.median / raster.median}
         if threads == 1:

@@ -11,16 +11,18 @@ import os
 import sys
 import threading
 from collections import OrderedDict
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
 from graings.camera.camera import Camera
 from graings.errors import CheckpointError
 from graings.image_encoding import ImageFormat, encode_image
-from graings.render import PreparedScene, render
+from graings.render import MotionBasisReport, PreparedScene, fast_scene, render_composition
 from graings.storage.compact import open_model
 from graings.storage.model import Model, scene_bytes
 from graings.storage.run_folder import newest_model
@@ -33,25 +35,46 @@ NICE = 5
 
 @dataclass(frozen=True, slots=True)
 class RenderRequest:
-    """Everything an image depends on, except the model. `time` is in [0, 1], `background` is RGB in [0, 1]."""
+    """Everything an image depends on, except the model. `time` is in [0, 1], `background` is RGB in [0, 1].
+
+    `fast` approximates the motion (`graings.render.fast_scene`).
+    """
 
     camera: Camera
     time: float
     background: tuple[float, float, float]
     format: ImageFormat
+    fast: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoadedModel:
-    """A model in memory, prepared for rendering."""
+class EncodedImage:
+    """The bytes of an image, and the seconds that each step took; none for one that was kept."""
 
-    model: Model
-    scene: PreparedScene
+    data: bytes
+    seconds: Mapping[str, float]
+
+
+class LoadedModel:
+    """A model in memory, prepared for rendering; for fast images when the first of them is asked for."""
+
+    def __init__(self, model: Model, scene: PreparedScene) -> None:
+        self.model, self.scene = model, scene
+        self._fast: tuple[PreparedScene, MotionBasisReport] | None = None
+        self._guard = threading.Lock()
 
     @property
     def bytes(self) -> int:
         """Memory that it takes."""
-        return scene_bytes(self.model.scene) + self.scene.bytes
+        fast = 0 if self._fast is None else self._fast[0].bytes
+        return scene_bytes(self.model.scene) + self.scene.bytes + fast
+
+    def fast(self) -> tuple[PreparedScene, MotionBasisReport]:
+        """The scene of fast images and its error. The first call takes seconds; may be called from several threads."""
+        with self._guard:
+            if self._fast is None:
+                self._fast = fast_scene(self.scene, self.model.views.get("train", ()))
+            return self._fast
 
 
 class ModelCache:
@@ -108,15 +131,15 @@ class RenderPool:
     def __init__(self, slots: int, kept_bytes: int) -> None:
         self._executor = ThreadPoolExecutor(slots, thread_name_prefix="render", initializer=_lower_priority)
         self._kept_bytes = kept_bytes
-        self._kept: OrderedDict[str, bytes] = OrderedDict()
-        self._running: dict[str, asyncio.Future[bytes]] = {}
+        self._kept: OrderedDict[str, EncodedImage] = OrderedDict()
+        self._running: dict[str, asyncio.Future[EncodedImage]] = {}
 
     @property
     def running(self) -> int:
         """Number of different images that are being rendered or wait for a thread."""
         return len(self._running)
 
-    async def render(self, loaded: LoadedModel, request: RenderRequest, key: str) -> bytes:
+    async def render(self, loaded: LoadedModel, request: RenderRequest, key: str) -> EncodedImage:
         """The encoded image; `key` identifies it with the model."""
         kept = self._kept.get(key)
         if kept is not None:
@@ -124,7 +147,9 @@ class RenderPool:
             return kept
         running = self._running.get(key)
         if running is None:
-            running = asyncio.get_running_loop().run_in_executor(self._executor, _rendered, loaded, request)
+            running = asyncio.get_running_loop().run_in_executor(
+                self._executor, _rendered, loaded, request, perf_counter()
+            )
             self._running[key] = running
             running.add_done_callback(lambda done: self._ended(key, done))
         return await asyncio.shield(running)  # a client that goes away does not end it for the others
@@ -133,14 +158,14 @@ class RenderPool:
         """End the threads; images that are not started yet are not rendered."""
         self._executor.shutdown(cancel_futures=True)
 
-    def _ended(self, key: str, done: asyncio.Future[bytes]) -> None:
+    def _ended(self, key: str, done: asyncio.Future[EncodedImage]) -> None:
         del self._running[key]
         if done.cancelled() or done.exception() is not None:
             return  # reported by those who wait
-        self._kept[key] = done.result()
-        size = sum(map(len, self._kept.values()))
+        self._kept[key] = EncodedImage(done.result().data, {})
+        size = sum(len(image.data) for image in self._kept.values())
         while size > self._kept_bytes:
-            size -= len(self._kept.popitem(last=False)[1])
+            size -= len(self._kept.popitem(last=False)[1].data)
 
 
 def _lower_priority() -> None:
@@ -149,9 +174,17 @@ def _lower_priority() -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICE))
 
 
-def _rendered(loaded: LoadedModel, request: RenderRequest) -> bytes:
-    result = render(loaded.scene, request.camera, request.time, request.background)
-    return encode_image(np.asarray(result.color, dtype=np.float32), request.format)
+def _rendered(loaded: LoadedModel, request: RenderRequest, queued: float) -> EncodedImage:
+    marks = [("queue", queued)]
+    scene = loaded.fast()[0] if request.fast else loaded.scene
+    marks.append(("scene", perf_counter()))
+    composition = scene.compose(request.camera.center, request.time)
+    marks.append(("raster", perf_counter()))
+    result = render_composition(composition, request.camera, request.background)
+    marks.append(("encode", perf_counter()))
+    data = encode_image(np.asarray(result.color, dtype=np.float32), request.format)
+    ends = [mark for _, mark in marks[1:]] + [perf_counter()]
+    return EncodedImage(data, {name: end - begin for (name, begin), end in zip(marks, ends, strict=True)})
 
 
 def _key(path: Path) -> _Key | None:

@@ -29,9 +29,10 @@ from graings.cli.synthesize import synthesize
 from graings.cli.terminal import metrics_line, motion_line, print_line
 from graings.cli.training import MultiValueCommand, Threads, ablate, train
 from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
+from graings.evaluation.metrics import psnr
 from graings.image_encoding import encode_image, image_format
 from graings.kernel import use_threads
-from graings.render import render
+from graings.render import PreparedScene, fast_scene, render
 from graings.report.evaluate_run import evaluate_run
 from graings.report.folder import report_runs
 from graings.report.metrics_document import METRICS_FILE, read_metrics
@@ -125,6 +126,12 @@ def render_view(
     background: Annotated[
         str | None, typer.Option(help="white, black, #rrggbb or r,g,b (default: as in training).")
     ] = None,
+    fast: Annotated[
+        bool,
+        typer.Option(
+            "--fast", help="Approximate the motion, as /render?fast=true does, and print how far it is from exact."
+        ),
+    ] = False,
     threads: Threads = None,
 ) -> None:
     """Render one view at one time; without --camera or --pose, an orbit around the scene."""
@@ -150,11 +157,18 @@ def render_view(
         raise typer.BadParameter(str(error)) from error
     if t is not None and time != t:
         print_line(f"Time {t:g} is outside the capture; rendered at {time:g}.")
+    scene, approximation = PreparedScene(model.scene), None
+    if fast:
+        exact = render(scene, view, time, rgb).color
+        scene, approximation = fast_scene(scene, model.views.get("train", ()))
     started = perf_counter()
-    result = render(model.scene, view, time, rgb)
+    result = render(scene, view, time, rgb)
     milliseconds = 1e3 * (perf_counter() - started)
     output.write_bytes(encode_image(result.color.numpy(), format))
     print_line(f"{output}: {view.width} x {view.height} at t = {time:g}, rendered in {milliseconds:.0f} ms.")
+    if approximation is not None:
+        print_line(f"Fast: {approximation.line}.")
+        print_line(f"This image has a PSNR of {psnr(result.color, exact):.1f} dB against the exact one.")
 
 
 @app.command()

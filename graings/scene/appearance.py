@@ -6,6 +6,7 @@ Every head is evaluated once per anchor and outputs one value per child slot.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -198,12 +199,22 @@ class ResidualField(TemporalHead):
         self, part: ResidualPart, time: Float[Tensor, " 1"], directions: Float[Tensor, "anchor 3"]
     ) -> Float[Tensor, "anchor child 4"]:
         """(Delta c, Delta o) of every slot at `time` in [0, 1], before the bound eta tanh of Eq. 12."""
+        return self.of_directions(part, time, [directions])[0]
+
+    def of_directions(
+        self, part: ResidualPart, time: Float[Tensor, " 1"], directions: Sequence[Float[Tensor, "anchor 3"]]
+    ) -> Float[Tensor, "view anchor child 4"]:
+        """As `forward` for several views of one time; one if nothing depends on the view."""
         encoded_time = self.encoded(time)
         time_only = self.predict(part.time_only, encoded_time)
         if self.seeing is None or part.seeing is None:
-            return time_only.unflatten(-1, (-1, 4))
-        view_dependent = self.seeing.predict(part.seeing, encoded_time, direction_encoding(directions, self.sh_degree))
-        return torch.cat([view_dependent.unflatten(-1, (-1, 3)), time_only.unsqueeze(-1)], dim=-1)
+            return time_only.unflatten(-1, (-1, 4)).unsqueeze(0)
+        count = len(directions)
+        hidden = part.seeing if count == 1 else _per_row(part.seeing.values.repeat(count, 1))
+        encoded = direction_encoding(torch.cat(list(directions)), self.sh_degree)
+        view_dependent = self.seeing.predict(hidden, encoded_time, encoded).view(count, len(time_only), -1, 3)
+        opacity = time_only.unsqueeze(-1).expand(count, -1, -1, 1)
+        return torch.cat([view_dependent, opacity], dim=-1)
 
     def encoded(self, time: Float[Tensor, " 1"]) -> Float[Tensor, " width"]:
         """gamma(t), which both heads receive."""

@@ -23,59 +23,30 @@ from typing import Final
 
 import torch
 from jaxtyping import Float, Int64
-from pydantic import Field
 from torch import Tensor
 
 from graings.camera.camera import View
-from graings.document import Document
 from graings.scene.children import LOG_SCALE_RANGE, Geometry, quaternion_product
+from graings.scene.motion_report import BasisReport, ErrorStatistics, MotionBasisReport
 from graings.scene.motion_signals import MOST_VIEWS, GeometrySignal, ResidualSignal, chosen
 from graings.scene.prepared import PreparedScene
+from graings.scene.prepared_appearance import BasisResidual
+from graings.scene.prepared_geometry import BasisGeometry
 from graings.scene.time_basis import TimeBasis, between, fit, quantile
 
-# Bounds for the 0.99 quantile of errors: of images that differ from the exact one by less than a viewer sees, and of
-# a player.
-FAST_PIXELS: Final = 0.1
+# Bounds for the 0.99 quantile of errors unless others are given.
 PLAYER_PIXELS: Final = 0.5
 LEVELS: Final = 1.0
+
+# Errors of single Gaussians average out where several are blended: with this, images differ by half a grey level RMS
+# (docs/experiments/serving.md).
+VIEW_LEVELS: Final = 4.0
 
 # Times at which functions are learned; as many between them are checked. At least SAMPLES_PER_PERIOD of the shortest
 # period that the networks' encoding of time has.
 LEAST_TIMES: Final = 64
 MOST_TIMES: Final = 128
 SAMPLES_PER_PERIOD: Final = 8
-
-
-class ErrorStatistics(Document):
-    """Errors over the children that have weights and the checked times; `max` over all children."""
-
-    rms: float = Field(ge=0, description="Root of the mean square.")
-    p99: float = Field(ge=0, description="What 99 % stay below.")
-    max: float = Field(ge=0, description="The largest, of children without weights too.")
-
-
-class BasisReport(Document):
-    """One of the two bases."""
-
-    bound: float = Field(gt=0, description="The bound asked for, of the 0.99 quantile.")
-    rank: int = Field(ge=0, description="Number of functions of time.")
-    samples: int = Field(ge=1, description="Samples of each function.")
-    children: int = Field(ge=0, description="Children with weights; all others do not change more than the bound.")
-    bytes: int = Field(ge=0, description="Weights and functions in float32.")
-    error: ErrorStatistics = Field(description="Measured, in the unit of the bound.")
-
-
-class MotionBasisReport(Document):
-    """What a motion basis is and how far it is from the exact scene."""
-
-    children: int = Field(ge=0, description="Children that some time and view may show.")
-    views: int = Field(ge=0, description="Training views in which pixels are measured.")
-    times: int = Field(ge=1, description="Times at which errors are measured, between those that it is learned from.")
-    geometry: BasisReport = Field(
-        description="Positions, rotations, log-scales: px in the training view nearest to each."
-    )
-    residual: BasisReport = Field(description="Colour and opacity of the residual, in grey levels of 255.")
-    seconds: float = Field(ge=0, description="Time it took.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +60,7 @@ class MotionBasis:
     log_scales: Float[Tensor, "child 3"]
     opacities: Float[Tensor, " child"]  # with `opacity_view` from the middle of the training views
     color_offsets: Float[Tensor, "child 3"]
+    opacity_offsets: Float[Tensor, " child"]  # the residual's part of `opacities`
     geometry: TimeBasis
     residual: TimeBasis
     report: MotionBasisReport
@@ -96,8 +68,28 @@ class MotionBasis:
     @property
     def bytes(self) -> int:
         """Memory of all arrays."""
-        arrays = (self.slots, self.uids, self.means, self.quats, self.log_scales, self.opacities, self.color_offsets)
-        return sum(array.numel() * array.element_size() for array in arrays) + self.geometry.bytes + self.residual.bytes
+        floats = (self.means, self.quats, self.log_scales, self.opacities, self.color_offsets)
+        numbers = (self.slots, self.uids)
+        return (
+            sum(array.numel() * array.element_size() for array in (*floats, *numbers))
+            + self.geometry.bytes
+            + self.residual.bytes
+        )
+
+    def prepared(self, exact: PreparedScene, *, view_levels: float = VIEW_LEVELS) -> PreparedScene:
+        """`exact`, the scene that this is the basis of, with motion and residual from the basis.
+
+        The residual's colours remain exact where averaging them over views changes more than 1 % of them by more than
+        `view_levels` of 255.
+        """
+        dtype = exact.scene.extent.dtype
+        states = [state.to(dtype) for state in (self.means, self.quats, self.log_scales)]
+        residual = torch.cat([self.color_offsets, self.opacity_offsets.unsqueeze(1)], dim=1).to(dtype)
+        seen = self.report.residual_of_views
+        return exact.with_basis(
+            BasisGeometry(self.geometry, *states),
+            BasisResidual(self.residual, residual, exact_colors=seen.p99 > view_levels),
+        )
 
     def geometry_at(self, time: float) -> Geometry:
         """Means, quaternions and log-scales of all children at `time`."""
@@ -115,7 +107,7 @@ class MotionBasis:
     @staticmethod
     @torch.inference_mode()
     def of(
-        prepared: PreparedScene, views: Sequence[View], *, pixels: float = FAST_PIXELS, levels: float = LEVELS
+        prepared: PreparedScene, views: Sequence[View], *, pixels: float = PLAYER_PIXELS, levels: float = LEVELS
     ) -> MotionBasis:
         """The basis of `prepared` within `pixels` in the training `views` and `levels` of 255 in colour and opacity.
 
@@ -142,6 +134,7 @@ class MotionBasis:
             log_scales=geometry.log_scales.float(),
             opacities=opacities.float(),
             color_offsets=residual.state[:, :3].float().contiguous(),
+            opacity_offsets=residual.state[:, 3].float().contiguous(),
             geometry=moving,
             residual=changing,
             report=MotionBasisReport(
@@ -150,6 +143,7 @@ class MotionBasis:
                 times=len(checked),
                 geometry=moving_report,
                 residual=changing_report,
+                residual_of_views=_statistics(255 * residual.view_errors(views)),
                 seconds=perf_counter() - started,
             ),
         )
@@ -170,16 +164,21 @@ def _fitted(
     """The basis of a signal, whose errors times `unit` are in the unit of the bound."""
     basis, found = fit(signal, signal.moving.nonzero().squeeze(-1), times, checked, bound / unit)
     found, rest = unit * found, unit * signal.rest_errors
-    statistics = ErrorStatistics(
-        rms=float(found.square().mean().sqrt()) if found.numel() else 0.0,
-        p99=quantile(found),
-        max=max([float(part.max()) for part in (found, rest) if part.numel()], default=0.0),
-    )
     return basis, BasisReport(
         bound=bound,
         rank=basis.rank,
         samples=len(basis.functions),
         children=len(basis.rows),
         bytes=basis.bytes,
-        error=statistics,
+        error=_statistics(found, rest),
+    )
+
+
+def _statistics(found: Tensor, rest: Tensor | None = None) -> ErrorStatistics:
+    """Of the errors `found`; those of the `rest` count for the largest only."""
+    largest = [float(part.max()) for part in (found, rest) if part is not None and part.numel()]
+    return ErrorStatistics(
+        rms=float(found.square().mean().sqrt()) if found.numel() else 0.0,
+        p99=quantile(found),
+        max=max(largest, default=0.0),
     )

@@ -24,6 +24,7 @@ REACH: Final = math.sqrt(-2.0 * math.log(constants.ALPHA_MIN))
 # Training views that pixels are measured in, and eyes that the residual is averaged over: evenly chosen.
 MOST_VIEWS: Final = 100
 MOST_EYES: Final = 4
+CHECKED_VIEWS: Final = 12  # that the average is compared with
 
 
 def chosen(views: Sequence[View], most: int) -> list[View]:
@@ -128,7 +129,7 @@ class ResidualSignal(TimeSignal):
         most = MOST_EYES if prepared.residual_depends_on_view else 1
         self.eyes = [view.camera.center for view in chosen(views, most)] or [np.zeros(3)]
         everything = torch.arange(prepared.children)
-        first = prepared.residual(times[0], self.eyes[0], everything[:1])
+        first = prepared.residual(times[0], self.eyes, everything[:1])
         self.child_scales = first.new_ones(prepared.children)
         self.value_scales = first.new_ones(4)
         self.state = first.new_zeros(prepared.children, 4)
@@ -141,14 +142,25 @@ class ResidualSignal(TimeSignal):
         self.rest_errors = rest[~self.moving]
 
     def at(self, time: float, rows: Int64[Tensor, " row"]) -> Float[Tensor, "row 4"]:
-        seen = [self._prepared.residual(time, eye, rows) for eye in self.eyes]
-        return torch.stack(seen).mean(0) - self.state[rows]
+        return self._prepared.residual(time, self.eyes, rows) - self.state[rows]
 
     def errors(
         self, rows: Int64[Tensor, " row"], found: Float[Tensor, "row 4"], expected: Float[Tensor, "row 4"]
     ) -> Float[Tensor, " row"]:
         largest: Tensor = (found - expected).abs().amax(-1)
         return largest
+
+    def view_errors(self, views: Sequence[View]) -> Float[Tensor, "view child"]:
+        """How far the colour that each of some `views` has at its time is from the mean over eyes."""
+        rows = torch.arange(self._prepared.children)
+        if len(self.eyes) == 1 or not len(rows):
+            return self.state.new_zeros(0, len(rows))
+        found = []
+        for view in chosen(views, CHECKED_VIEWS):
+            mean = self.at(view.time, rows) + self.state
+            seen = self._prepared.residual(view.time, [view.camera.center], rows)
+            found.append((seen - mean)[:, :3].abs().amax(-1))
+        return torch.stack(found)
 
 
 def _unit(rotations: Float[Tensor, "row 4"]) -> Float[Tensor, "row 4"]:

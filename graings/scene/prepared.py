@@ -16,8 +16,10 @@ o_can over all directions takes its place, enlarged by a bound of the rounding o
 
 from __future__ import annotations
 
+import copy
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -30,8 +32,8 @@ from graings import constants
 from graings.gaussians import Gaussians
 from graings.scene.activations import tanh
 from graings.scene.children import Geometry
-from graings.scene.prepared_appearance import Candidates, Changes, PreparedAppearance, Rendered
-from graings.scene.prepared_geometry import prepared_geometry
+from graings.scene.prepared_appearance import BasisResidual, Candidates, Changes, PreparedAppearance, Rendered
+from graings.scene.prepared_geometry import PreparedGeometry, prepared_geometry
 from graings.scene.scene import Composed, Scene
 
 # Times of which geometry and opacities are kept: players show one time from many views, or a few times again.
@@ -75,6 +77,14 @@ class PreparedScene:
         self._instants: OrderedDict[float, _Instant] = OrderedDict()
         self._guard = threading.Lock()
 
+    def with_basis(self, geometry: PreparedGeometry, residual: BasisResidual) -> PreparedScene:
+        """The same scene with another way of evaluating time; what does not depend on time is shared."""
+        other = copy.copy(self)
+        other._geometry = geometry
+        other._appearance = self._appearance.with_basis(residual)
+        other._instants, other._guard = OrderedDict(), threading.Lock()
+        return other
+
     @property
     def children(self) -> int:
         """Number of children that some time and view may show."""
@@ -106,9 +116,9 @@ class PreparedScene:
         return self._geometry.at(time, rows)
 
     @torch.inference_mode()
-    def residual(self, time: float, eye: ArrayLike, rows: Int64[Tensor, " row"]) -> Float[Tensor, "row 4"]:
-        """(Delta c, Delta o) of Eq. 12 of the children `rows` (ascending) at `time` from `eye`; 0 without residual."""
-        return self._appearance.residual(time, eye, self._candidates.slots.index_select(0, rows))
+    def residual(self, time: float, eyes: Sequence[ArrayLike], rows: Int64[Tensor, " row"]) -> Float[Tensor, "row 4"]:
+        """(Delta c, Delta o) of Eq. 12 of the children `rows` (ascending) at `time`, the mean over `eyes`; else 0."""
+        return self._appearance.residual(time, eyes, self._candidates.slots.index_select(0, rows))
 
     @property
     def residual_depends_on_view(self) -> bool:

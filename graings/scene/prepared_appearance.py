@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import copy
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,9 +14,11 @@ from torch import Tensor
 
 from graings import constants, kernel
 from graings.scene.appearance import ResidualPart, TemporalHead
+from graings.scene.child_blocks import BLOCK, in_blocks
 from graings.scene.encoding import direction_width, directions_from
 from graings.scene.perceptron import GroupBias
 from graings.scene.scene import Scene
+from graings.scene.time_basis import TimeBasis, interpolated
 
 
 class Candidates(NamedTuple):
@@ -38,10 +41,35 @@ class Rendered(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changes:
-    """The residual at one time, before its bound."""
+    """The residual at one time: before its bound, except `colors`."""
 
-    time_only: Float[Tensor, "anchor value"]  # for each slot Delta o, after Delta c where that has no direction
-    biases: list[Tensor]  # of the head of Delta c that receives the direction; empty where there is none
+    time_only: Float[Tensor, "anchor value"] | None  # for each slot Delta o, after Delta c where it has no direction
+    biases: list[Tensor]  # of the head of Delta c that receives the direction; empty where it is not evaluated
+    colors: Float[Tensor, "gaussian 3"] | None = None  # Delta c of the rendered children, by a basis
+
+
+class BasisResidual:
+    """(Delta c, Delta o) by a basis of functions of time, which describes offsets from `state`.
+
+    With `exact_colors` the basis is used for Delta o only.
+    """
+
+    def __init__(self, basis: TimeBasis, state: Float[Tensor, "child 4"], *, exact_colors: bool) -> None:
+        self._functions = basis.functions.to(state.dtype)
+        self._weights = basis.in_blocks(len(state), state.dtype)
+        self._state = in_blocks(state)
+        self.exact_colors = exact_colors
+
+    def at(self, time: float) -> Float[Tensor, "row 4"]:
+        """Of all children, and of some rows that fill the last block."""
+        found = self._state.new_empty(len(self._state) * BLOCK, 4)
+        functions = interpolated(self._functions, time).contiguous()
+        kernel.kernel().blend(*self._weights, self._state, functions, found, kernel.thread_count())
+        return found
+
+    def tensors(self) -> Iterable[Tensor]:
+        """What is kept in memory."""
+        return (*self._weights, self._state, self._functions)
 
 
 class _Head:
@@ -68,6 +96,7 @@ class PreparedAppearance:
         layers = map(_contiguous, scene.appearance.color_layers(part))
         self._canonical = (part.normals, scene.appearance.color_sh_degree, part.hidden.values, *layers)
         self._residual = scene.residual if scene.temporal else None
+        self._basis: BasisResidual | None = None
         self._part: ResidualPart | None = None
         self._time_only: _Head | None = None
         self._seeing: _Head | None = None
@@ -78,26 +107,36 @@ class PreparedAppearance:
                 others = direction_width(self._residual.sh_degree)
                 self._seeing = _Head(self._residual.seeing, parts.seeing, others)
 
+    def with_basis(self, basis: BasisResidual) -> PreparedAppearance:
+        """The same, with the residual of a time from `basis`."""
+        other = copy.copy(self)
+        other._basis = None if self._residual is None else basis
+        return other
+
     def tensors(self) -> Iterable[Tensor]:
         """What is kept in memory."""
         heads = [head for head in (self._time_only, self._seeing) if head is not None]
         canonical = [part for part in self._canonical if isinstance(part, Tensor)]
-        return (self._positions, *canonical, *(head.hidden for head in heads))
+        basis = () if self._basis is None else self._basis.tensors()
+        return (self._positions, *canonical, *(head.hidden for head in heads), *basis)
 
     @property
     def residual_depends_on_view(self) -> bool:
         """Whether Delta c of Eq. 12 receives the viewing direction."""
         return self._seeing is not None
 
-    def residual(self, time: float, eye: ArrayLike, slots: Int64[Tensor, " child"]) -> Float[Tensor, "child 4"]:
-        """(Delta c, Delta o) of Eq. 12 of the ascending `slots` of these anchors."""
+    def residual(
+        self, time: float, eyes: Sequence[ArrayLike], slots: Int64[Tensor, " child"]
+    ) -> Float[Tensor, "child 4"]:
+        """(Delta c, Delta o) of Eq. 12 of the ascending `slots` of these anchors, the mean over `eyes`."""
         if self._residual is None or self._part is None or not len(slots):
             return self._positions.new_zeros(len(slots), 4)
-        count = self._slots
-        first, last = int(slots[0]) // count, int(slots[-1]) // count + 1
-        part, times = self._part.of_anchors(first, last), self._positions.new_tensor([time])
-        raw = self._residual(part, times, directions_from(eye, self._positions[first:last]))
-        return self._residual.bounded(raw.flatten(0, 1).index_select(0, slots - first * count))
+        first, last = int(slots[0]) // self._slots, int(slots[-1]) // self._slots + 1
+        directions = [directions_from(eye, self._positions[first:last]) for eye in eyes]
+        raw = self._residual.of_directions(
+            self._part.of_anchors(first, last), self._positions.new_tensor([time]), directions
+        )
+        return self._residual.bounded(raw.flatten(1, 2).index_select(1, slots - first * self._slots)).mean(0)
 
     def rendered(
         self, candidates: Candidates, opacities: Float[Tensor, "anchor child"], time: float
@@ -109,18 +148,23 @@ class PreparedAppearance:
         count = len(candidates.slots)
         rows, slots, children, uids = candidates.slots.new_empty(4, count).unbind(0)
         found = Rendered(rows, slots, children, uids, opacities.new_empty(count))
-        head: tuple[Any, ...] = (None, [], [], None, 0.0)
-        changes = None
+        network: tuple[Any, ...] = (None, [], [], None)
+        blended = changed = changes = None
         if self._residual is not None and self._time_only is not None:
             encoded_time = self._residual.encoded(self._positions.new_tensor([time]))
-            biases = self._time_only.biases(encoded_time)
-            changes = Changes(
-                self._positions.new_empty(len(self._positions), len(biases[-1])),
-                [] if self._seeing is None else self._seeing.biases(encoded_time),
-            )
-            head = (self._time_only.hidden, self._time_only.weights, biases, changes.time_only, self._residual.scale)
-        inputs = (*candidates, opacities, *head, constants.ALPHA_MIN)
-        count = kernel.kernel().choose(*inputs, *found, kernel.thread_count())
+            seeing = None if self._basis is not None and not self._basis.exact_colors else self._seeing
+            biases = [] if seeing is None else seeing.biases(encoded_time)
+            if self._basis is None:
+                time_biases = self._time_only.biases(encoded_time)
+                changes = Changes(self._positions.new_empty(len(self._positions), len(time_biases[-1])), biases)
+                network = (self._time_only.hidden, self._time_only.weights, time_biases, changes.time_only)
+            else:
+                blended, changed = self._basis.at(time), self._positions.new_empty(count, 3)
+        bounds = (0.0 if self._residual is None else self._residual.scale, constants.ALPHA_MIN)
+        inputs = (*candidates, opacities, *network, blended, *bounds)
+        count = kernel.kernel().choose(*inputs, *found, changed, kernel.thread_count())
+        if changed is not None:
+            changes = Changes(None, biases, None if biases else changed[:count])
         return Rendered._make(part[:count] for part in found), changes
 
     def colors(
@@ -131,15 +175,17 @@ class PreparedAppearance:
         Equal to the bit to `CanonicalAppearance.colors`, the bounded residual and the clip of `Scene.compose`. Raises
         `ValueError` for children out of order.
         """
-        change: tuple[Any, ...] = (0, None, [], [], None, 0.0)
+        network: tuple[Any, ...] = (0, None, [], [])
+        time_only = blended = None
         if changes is not None and self._residual is not None:
-            change = (0, None, [], [], changes.time_only, self._residual.scale)
-            if self._seeing is not None:
-                head = (self._seeing.hidden, self._seeing.weights, changes.biases)
-                change = (self._residual.sh_degree, *head, None, self._residual.scale)
+            time_only, blended = changes.time_only, changes.colors
+            if self._seeing is not None and blended is None:
+                network = (self._residual.sh_degree, self._seeing.hidden, self._seeing.weights, changes.biases)
+                time_only = None
+        scale = 0.0 if self._residual is None else self._residual.scale
         colors = self._positions.new_empty(len(children), 3)
         view = (np.asarray(eye, dtype=np.float64).ravel(), constants.NEAR)
-        inputs = (self._positions, *self._canonical, *change, *view, children)
+        inputs = (self._positions, *self._canonical, *network, time_only, blended, scale, *view, children)
         kernel.kernel().paint(*inputs, colors, kernel.thread_count())
         return colors
 

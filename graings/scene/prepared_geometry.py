@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
-from torch.nn import functional
 
 from graings import kernel
 from graings.scene.canonical import default_geometry
+from graings.scene.child_blocks import ActiveUnits, in_blocks
 from graings.scene.children import (
     LOG_SCALE_RANGE,
     MAX_LOG_SCALE_OFFSET,
@@ -22,9 +22,7 @@ from graings.scene.children import (
 )
 from graings.scene.deformation import DeformationNetwork
 from graings.scene.scene import Scene
-
-# Children side by side in one block of the kernel's arrays.
-BLOCK = 16
+from graings.scene.time_basis import TimeBasis, interpolated
 
 
 class PreparedGeometry(ABC):
@@ -101,35 +99,33 @@ class _Factorized(PreparedGeometry):
         return (*self._hidden, self._rest)
 
 
+class BasisGeometry(PreparedGeometry):
+    """By a basis of functions of time, which describes offsets from the states `means`, `quats`, `log_scales`."""
+
+    def __init__(
+        self,
+        basis: TimeBasis,
+        means: Float[Tensor, "child 3"],
+        quats: Float[Tensor, "child 4"],
+        log_scales: Float[Tensor, "child 3"],
+    ) -> None:
+        self._functions = basis.functions.to(means.dtype)
+        self._weights = basis.in_blocks(len(means), means.dtype)
+        self._rest = in_blocks(torch.cat([means, quats, log_scales], dim=1))
+        self._bias = means.new_zeros(10)
+
+    def at(self, time: float, rows: Tensor) -> Geometry:
+        functions = interpolated(self._functions, time).T
+        return move(self._weights, self._rest, functions, self._bias, 1.0, rows, largest_change=math.inf)
+
+    def tensors(self) -> Iterable[Tensor]:
+        return (*self._weights, self._rest, self._functions)
+
+
 def unmoved(canonical: Float[Tensor, "child 7"], children: Children) -> Float[Tensor, "child 10"]:
     """Mean, unit quaternion and log-scale, not yet clipped, of children without an offset in time."""
     means, quats, _ = compose(canonical, children, None, 1.0, projected_clip=False)
     return torch.cat([means, quats, children.anchor_log_scales + canonical[:, 4:]], dim=1)
-
-
-def in_blocks(rows: Float[Tensor, "child width"]) -> Float[Tensor, "block width 16"]:
-    """`rows` in blocks of `BLOCK` children, transposed; the last one is filled with zeros."""
-    padded = functional.pad(rows, (0, 0, 0, -len(rows) % BLOCK))
-    return padded.view(-1, BLOCK, rows.shape[1]).transpose(1, 2).contiguous()
-
-
-class ActiveUnits(NamedTuple):
-    """Hidden units in blocks of `BLOCK` children, without those that ReLU makes zero in a whole block.
-
-    A third is left out, because children near each other share theirs; it adds exactly nothing to a sum.
-    """
-
-    values: Float[Tensor, "active 16"]
-    begin: Int64[Tensor, " _"]  # of each block in `values`, and the end of the last
-    units: Int32[Tensor, " active"]  # which hidden unit each row of `values` is
-
-    @staticmethod
-    def of(hidden: Float[Tensor, "child width"]) -> ActiveUnits:
-        """Those of `hidden`."""
-        blocks = in_blocks(hidden)
-        active = (blocks != 0).any(2)
-        begin = functional.pad(active.sum(1).cumsum(0), (1, 0))
-        return ActiveUnits(blocks[active], begin, active.nonzero()[:, 1].int())
 
 
 def move(
@@ -139,6 +135,7 @@ def move(
     bias: Float[Tensor, " 10"],
     extent: float,
     rows: Int64[Tensor, " gaussian"],
+    largest_change: float = MAX_LOG_SCALE_OFFSET,
 ) -> Geometry:
     """Geometry (Eq. 10) of the children `rows` with the offsets `weights` @ hidden units + `bias`.
 
@@ -146,6 +143,6 @@ def move(
     `ValueError` for a row out of range.
     """
     geometry = rest.new_empty(len(rows), 3), rest.new_empty(len(rows), 4), rest.new_empty(len(rows), 3)
-    bounds = (extent, MAX_LOG_SCALE_OFFSET, *LOG_SCALE_RANGE)
+    bounds = (extent, largest_change, *LOG_SCALE_RANGE)
     kernel.kernel().move(*hidden, rest, weights.contiguous(), bias, *bounds, rows, *geometry, kernel.thread_count())
     return geometry

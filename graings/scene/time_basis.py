@@ -17,9 +17,11 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from graings.scene.child_blocks import ActiveUnits
+
 # Children that the functions are learned from, evenly chosen; weights are then found for all.
 LEARNED_FROM: Final = 4096
-CHILDREN_AT_ONCE: Final = 8192
+CHILDREN_AT_ONCE: Final = 16384
 MOST_SAMPLES: Final = 1025  # of each function of time
 QUANTILE: Final = 0.99  # of the errors of children and instants: what the bound holds for
 # Share of the bound that the rank may use; the rest is for the interpolation between samples.
@@ -52,6 +54,12 @@ class TimeBasis:
     def bytes(self) -> int:
         """Size of weights and functions in float32."""
         return 4 * (self.weights.numel() + self.functions.numel())
+
+    def in_blocks(self, children: int, dtype: torch.dtype) -> ActiveUnits:
+        """Weights of all `children` in blocks for the kernel; a block in which none has weights takes no memory."""
+        return ActiveUnits.of(
+            torch.zeros(children, self.rank, dtype=dtype).index_copy(0, self.rows, self.weights.to(dtype))
+        )
 
     def at(self, time: float) -> Float[Tensor, "rank value"]:
         """The functions at `time` in [0, 1]."""

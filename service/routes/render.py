@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Mapping
+from time import perf_counter
 from typing import Annotated, Any
 
 import numpy as np
@@ -41,6 +43,14 @@ _IMAGES: dict[int | str, dict[str, Any]] = {
             "X-Graings-Orbit": {
                 "schema": {"type": "string"},
                 "description": "azimuth elevation radius of an orbit.",
+            },
+            "X-Graings-Fast": {
+                "schema": {"type": "string"},
+                "description": "With fast: how far the approximation is from exact, in px and grey levels.",
+            },
+            "Server-Timing": {
+                "schema": {"type": "string"},
+                "description": "Milliseconds of request, queue, scene, raster and encode; a kept image has the first.",
             },
             "X-Time-Clamped": {
                 "schema": {"type": "number"},
@@ -86,6 +96,10 @@ class RenderQuery(BaseModel):
     height: int | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels.")
     background: str | None = Field(None, max_length=60, description="white, black, #rrggbb or r,g,b in [0, 1].")
     format: ImageFormat | None = Field(None, description="Instead of the Accept header.")
+    fast: bool = Field(
+        False,
+        description="Approximate the motion; X-Graings-Fast says by how much. The first such image takes seconds.",
+    )
 
 
 @router.get("/render", operation_id="render", response_class=Response, responses={**_IMAGES, **RESPONSES})
@@ -96,6 +110,7 @@ async def render(
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """Render the newest model, or a job's newest checkpoint while it trains, at time `t` from a viewpoint."""
+    started = perf_counter()
     format = query.format or _format(accept)
     job_id, loaded = await to_thread.run_sync(_model, context, query.job)
     model = loaded.model
@@ -104,7 +119,7 @@ async def render(
         camera, time, background = view.resolve(model.views, model.units, model.background)
     except ValueError as error:
         raise BadRequest(f"{error}.") from error
-    request = RenderRequest(camera, time, background, format)
+    request = RenderRequest(camera, time, background, format, query.fast)
     headers = {
         "ETag": _etag(model, request),
         "Vary": "Accept",
@@ -120,8 +135,17 @@ async def render(
         headers["X-Graings-Orbit"] = _orbit_header(view, camera, model.units)
     if _matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
+    resolved = perf_counter()
     image = await context.pool.render(loaded, request, headers["ETag"])
-    return Response(image, media_type=MEDIA_TYPES[format], headers=headers)
+    if request.fast:
+        headers["X-Graings-Fast"] = (await to_thread.run_sync(loaded.fast))[1].line
+    headers["Server-Timing"] = _server_timing({"request": resolved - started, **image.seconds})
+    return Response(image.data, media_type=MEDIA_TYPES[format], headers=headers)
+
+
+def _server_timing(seconds: Mapping[str, float]) -> str:
+    """Milliseconds of each step, in order, as browsers show them."""
+    return ", ".join(f"{name};dur={1e3 * duration:.2f}" for name, duration in seconds.items())
 
 
 def _format(accept: str | None) -> ImageFormat:
@@ -212,7 +236,7 @@ def _etag(model: Model, request: RenderRequest) -> str:
         model.digest,
         camera.world_to_camera.tolist(),
         (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
-        (request.time, request.background, request.format),
+        (request.time, request.background, request.format, request.fast),
     )
     return f'"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}"'
 

@@ -14,6 +14,7 @@ import pytest
 from graings.capture.synthetic import write_synthetic
 from graings.cli.main import main
 from graings.config import TrainConfig, make_config
+from graings.evaluation.metrics import psnr
 from graings.storage.checkpoint import load_model, newest_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -113,6 +114,18 @@ def test_evaluating_on_another_background_does_not_change_metrics_json(
     assert f"PSNR {json.loads(before)['splits']['val']['psnr']:.2f} dB" in outputs[0]
     assert "PSNR" in outputs[1]
     assert outputs[1] != outputs[0]
+
+
+def test_a_fast_view_differs_by_what_is_printed(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    view = ("--camera", "test:1", "--t", 0.3)
+    assert graings("render", run, *view, "-o", tmp_path / "exact.exr") == 0
+    assert "Fast" not in capsys.readouterr().out
+    assert graings("render", run, *view, "--fast", "-o", tmp_path / "fast.exr") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "px for 99 %" in printed
+    found = psnr(pixels(tmp_path / "fast.exr"), pixels(tmp_path / "exact.exr"))
+    assert f"a PSNR of {found:.0f}" in printed.replace(f"{found:.1f}", f"{found:.0f}")
+    assert found > 40
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".exr"])

@@ -10,14 +10,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from graings import constants, kernel
 from graings.camera.camera import Camera, View
 from graings.camera.sampling_rate import SamplingRate
+from graings.evaluation.metrics import psnr
+from graings.render import render
+from graings.scene.child_blocks import BLOCK, ActiveUnits
 from graings.scene.motion_basis import MotionBasis
 from graings.scene.motion_signals import GeometrySignal, ResidualSignal
 from graings.scene.prepared import PreparedScene
 from graings.scene.scene import Scene
 from graings.scene.time_basis import QUANTILE, TimeBasis, errors, fit, quantile
-from tests.models import tiny_scene
+from tests.models import EYE, tiny_scene
 from tests.scene.test_prepared import CONFIGS, scene_of
 
 VIEWS = [
@@ -105,7 +109,7 @@ def scene_with_one_mover() -> Scene:
 
 def test_children_without_motion_have_no_weights() -> None:
     prepared = PreparedScene(scene_with_one_mover())
-    basis = MotionBasis.of(prepared, VIEWS)
+    basis = MotionBasis.of(prepared, VIEWS, pixels=0.1)
     assert 5 < len(basis.geometry.rows) < 0.5 * prepared.children
     at_rest = measured(prepared, replace(basis, geometry=TimeBasis.empty(10)), OTHER_TIMES).amax(0)
     assert float(at_rest.max()) > 1.0
@@ -121,7 +125,7 @@ def test_a_constant_offset_is_part_of_the_state_not_of_the_motion() -> None:
         scene.deformation.out.weight.zero_()
         scene.deformation.out.bias[:3] = 0.3
     prepared = PreparedScene(scene)
-    basis = MotionBasis.of(prepared, VIEWS)
+    basis = MotionBasis.of(prepared, VIEWS, pixels=0.1)
     assert basis.geometry.rank == 0
     found, expected = basis.geometry_at(0.4), prepared.geometry(0.4, torch.arange(prepared.children))
     for here, there in zip(found, expected, strict=True):
@@ -143,7 +147,7 @@ def test_a_scene_of_one_instant_has_no_functions(config: dict[str, Any]) -> None
 
 def test_nothing_shown_and_no_views() -> None:
     scene = scene_of({})
-    assert MotionBasis.of(PreparedScene(scene), []).report.geometry.error.p99 <= 0.1
+    assert MotionBasis.of(PreparedScene(scene), [], pixels=0.1).report.geometry.error.p99 <= 0.1
     with torch.no_grad():
         scene.scaffold.opacity_offsets.fill_(-5.0)
     basis = MotionBasis.of(PreparedScene(scene), VIEWS)
@@ -163,7 +167,9 @@ def test_a_huge_scene_has_the_same_rank_as_a_small_one() -> None:
         View(view.name, Camera.orbit(37.0 * number, 20.0, 3.0 * size, fov=0.9, width=200, height=150), view.time)
         for number, view in enumerate(VIEWS)
     ]
-    one, other = MotionBasis.of(PreparedScene(small), VIEWS), MotionBasis.of(PreparedScene(large), far)
+    one, other = (
+        MotionBasis.of(PreparedScene(scene), views, pixels=0.1) for scene, views in ((small, VIEWS), (large, far))
+    )
     assert abs(one.geometry.rank - other.geometry.rank) <= 1
     assert other.report.geometry.error.p99 <= 0.1
 
@@ -171,7 +177,7 @@ def test_a_huge_scene_has_the_same_rank_as_a_small_one() -> None:
 def test_times_of_the_views_may_be_anywhere() -> None:
     prepared = PreparedScene(tiny_scene(anchors=60))
     crowded = [View(view.name, view.camera, 0.001 * number**2) for number, view in enumerate(VIEWS)]
-    basis = MotionBasis.of(prepared, crowded)
+    basis = MotionBasis.of(prepared, crowded, pixels=0.1)
     assert quantile(measured(prepared, basis, OTHER_TIMES)) <= 0.15
 
 
@@ -187,7 +193,7 @@ def test_turning_all_the_way_around() -> None:
         return means, torch.stack([angle.cos(), angle.sin(), angle * 0, angle * 0]).expand_as(quats), log_scales
 
     prepared.geometry = turning  # type: ignore[method-assign]
-    basis = MotionBasis.of(prepared, VIEWS)
+    basis = MotionBasis.of(prepared, VIEWS, pixels=0.1)
     assert 0 < basis.geometry.rank <= 3
     assert quantile(measured(prepared, basis, OTHER_TIMES)) <= 0.1
 
@@ -216,7 +222,7 @@ def test_the_residual_that_depends_on_the_view_is_its_mean_over_eyes() -> None:
     signal = ResidualSignal(prepared, VIEWS, times, 1e-4)
     assert len(signal.eyes) > 1
     rows = torch.arange(prepared.children)
-    mean = torch.stack([prepared.residual(0.3, eye, rows) for eye in signal.eyes]).mean(0)
+    mean = torch.stack([prepared.residual(0.3, [eye], rows) for eye in signal.eyes]).mean(0)
     torch.testing.assert_close(signal.at(0.3, rows) + signal.state, mean, rtol=0, atol=1e-6)
 
 
@@ -227,3 +233,87 @@ def test_fitting_no_children_gives_no_functions() -> None:
     assert basis.rank == found.numel() == errors(signal, basis, [0.5]).numel() == 0
     assert TimeBasis.empty(10).offsets(0.3).shape == (0, 10)
     assert quantile(torch.arange(1000.0)) == pytest.approx(1000 * QUANTILE, abs=1)
+
+
+@pytest.mark.usefixtures("isa")
+@pytest.mark.parametrize("config", CONFIGS, ids=str)
+def test_the_fast_scene_shows_what_the_basis_says(config: dict[str, Any]) -> None:
+    exact = PreparedScene(scene_of(config))
+    basis = MotionBasis.of(exact, VIEWS, pixels=0.2, levels=255.0)  # which also averages colours over views
+    fast, eye = basis.prepared(exact, view_levels=255.0), VIEWS[4].camera.center
+    for time in (0.0, 0.31, 1.0):
+        residual = basis.residual_at(time)
+        shown = residual[:, 3] > constants.ALPHA_MIN
+        composed = fast.compose(eye, time)
+        if config.get("opacity_view") is None:  # otherwise the state has the opacities of another view
+            assert torch.equal(composed.children, basis.slots[shown])
+        rows = torch.searchsorted(basis.slots, composed.children)
+        gaussians = composed.gaussians
+        for found, expected in zip(
+            (gaussians.means, gaussians.quats, gaussians.log_scales), basis.geometry_at(time), strict=True
+        ):
+            torch.testing.assert_close(found, expected[rows], rtol=1e-5, atol=1e-5)
+        offset = residual[rows, 3] - basis.opacities[rows] + basis.opacity_offsets[rows]
+        opacities = exact.canonical_opacities(eye)[rows] + offset
+        torch.testing.assert_close(gaussians.opacities, opacities, rtol=0, atol=1e-5)
+        colors = (exact.canonical_colors(eye)[rows] + residual[rows, :3]).clamp(0, 1)
+        torch.testing.assert_close(gaussians.colors, colors, rtol=0, atol=1e-5)
+        assert torch.equal(gaussians.uids, basis.uids[rows])
+
+
+def test_the_fast_scene_in_float64() -> None:
+    exact = PreparedScene(scene_of({}).double())
+    fast = MotionBasis.of(exact, VIEWS, pixels=0.01).prepared(exact)
+    found, expected = fast.compose(EYE, 0.31), exact.compose(EYE, 0.31)
+    here = found.gaussians.means[torch.isin(found.children, expected.children)]
+    there = expected.gaussians.means[torch.isin(expected.children, found.children)]
+    assert here.dtype == torch.float64
+    torch.testing.assert_close(here, there, rtol=0, atol=1e-3)
+
+
+def test_colours_of_the_residual_stay_exact_where_the_view_counts_more_than_the_bound() -> None:
+    exact = PreparedScene(scene_of({"residual_sh_degree": 2}))
+    basis = MotionBasis.of(exact, VIEWS, levels=0.1)
+    assert basis.report.residual_of_views.p99 > 0.1
+    found, expected = basis.prepared(exact, view_levels=0.1).compose(EYE, 0.31), exact.compose(EYE, 0.31)
+    both = torch.isin(found.children, expected.children)
+    assert torch.equal(
+        found.gaussians.colors[both],
+        expected.gaussians.colors[torch.isin(expected.children, found.children)],
+    )
+
+
+def test_the_fast_image_is_as_near_as_its_bound_says() -> None:
+    """To first order a shift by d px changes a pixel by at most 6.13 d of its contrast."""
+    exact = PreparedScene(scene_of({}))
+    psnrs = []
+    for pixels in (1.0, 0.1, 0.01):
+        fast = MotionBasis.of(exact, VIEWS, pixels=pixels, levels=2 * pixels).prepared(exact)
+        images = [render(scene, VIEWS[3].camera, 0.41, (1.0, 1.0, 1.0)).color for scene in (fast, exact)]
+        psnrs.append(psnr(*images))
+        assert float((images[0] - images[1]).square().mean().sqrt()) < 6.13 * pixels
+    assert psnrs[0] < psnrs[1] < psnrs[2]
+    assert psnrs[2] > 55
+
+
+def test_the_fast_scene_keeps_its_own_times() -> None:
+    exact = PreparedScene(scene_of({}))
+    fast = MotionBasis.of(exact, VIEWS, pixels=2.0).prepared(exact)
+    here, there = exact.compose(EYE, 0.5).gaussians.means, fast.compose(EYE, 0.5).gaussians.means
+    assert here.shape != there.shape or not torch.equal(here, there)
+    assert torch.equal(exact.compose(EYE, 0.5).gaussians.means, here)
+    assert fast.bytes > 0
+
+
+@pytest.mark.parametrize("wrong", ["units", "begin", "out"])
+def test_the_blend_kernel_refuses_arrays_that_do_not_fit(wrong: str) -> None:
+    weights, functions, out = ActiveUnits.of(torch.ones(2 * BLOCK, 3)), torch.ones(3, 4), torch.empty(2 * BLOCK, 4)
+    begin, units = weights.begin, weights.units
+    if wrong == "units":
+        units = units + 1
+    elif wrong == "begin":
+        begin = begin + 1
+    else:
+        out = torch.empty(2 * BLOCK, 3)
+    with pytest.raises(ValueError, match=wrong):
+        kernel.kernel().blend(weights.values, begin, units, torch.zeros(2, 4, BLOCK), functions, out, 1)

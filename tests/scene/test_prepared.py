@@ -12,10 +12,11 @@ from torch import Tensor
 from graings import constants, kernel
 from graings.camera.camera import Camera
 from graings.render import draw, render
+from graings.scene.child_blocks import BLOCK, ActiveUnits, in_blocks
 from graings.scene.children import compose, gather, plain_compose
 from graings.scene.perceptron import perceptron, plain_perceptron
 from graings.scene.prepared import KEPT_TIMES, PreparedScene, possible_children
-from graings.scene.prepared_geometry import BLOCK, ActiveUnits, in_blocks, move, unmoved
+from graings.scene.prepared_geometry import move, unmoved
 from graings.scene.scene import Composed, Scene
 from tests.models import EYE, tiny_scene
 

@@ -18,7 +18,7 @@ from graings.camera.camera import Camera
 from graings.camera.view_request import MAX_SIDE
 from graings.camera.viewpoint import orbit_view
 from graings.image_encoding import encode_image
-from graings.render import PreparedScene, render
+from graings.render import PreparedScene, fast_scene, render
 from graings.storage.checkpoint import load_model
 from jobs.store import JobFolder
 from service.rendering import LoadedModel, ModelCache, RenderPool, RenderRequest
@@ -44,6 +44,30 @@ def test_a_view_of_the_capture_is_what_the_library_renders(client: TestClient, m
     assert answer.headers["x-graings-job"] == model
     assert answer.headers["x-graings-iteration"] == str(ITERATIONS)
     assert answer.headers["x-graings-finished"] == "true"
+
+
+def test_a_fast_image_is_that_of_the_approximated_scene(client: TestClient, model: str, trained: Path) -> None:
+    view = {"t": 0.37, "camera": "val:1"}
+    exact, fast = (client.get("/render", params={**view, "fast": fast}) for fast in (False, True))
+    loaded = load_model(trained)
+    scene, report = fast_scene(PreparedScene(loaded.scene), loaded.views["train"])
+    expected = render(scene, loaded.views["val"][1].camera, 0.37, loaded.background)
+    assert fast.content == encode_image(expected.color.numpy(), "png")
+    assert fast.headers["x-graings-fast"] == report.line
+    assert "x-graings-fast" not in exact.headers
+    assert exact.content == client.get("/render", params=view).content
+    assert exact.headers["etag"] != fast.headers["etag"]
+    assert client.get("/render", params={**view, "fast": "quick"}).status_code == 422
+
+
+def test_the_times_of_an_image_stand_in_its_answer(client: TestClient, model: str) -> None:
+    """https://www.w3.org/TR/server-timing/, which browsers show beside the request."""
+    first, again = (client.get("/render", params={"t": 0.123}).headers["server-timing"] for _ in range(2))
+    steps = [part.split(";dur=") for part in first.split(", ")]
+    assert [name for name, _ in steps] == ["request", "queue", "scene", "raster", "encode"]
+    assert all(float(duration) >= 0 for _, duration in steps)
+    assert again.startswith("request;dur=")
+    assert "encode" not in again  # the image was kept
 
 
 def test_an_orbit_takes_its_defaults_from_the_capture(client: TestClient, model: str, trained: Path) -> None:
@@ -250,7 +274,7 @@ def test_requests_for_one_image_share_its_rendering_and_get_equal_bytes(trained:
     images: list[bytes] = []
 
     async def send(time: float) -> None:
-        images.append(await pool.render(model, request_at(time), str(time)))
+        images.append((await pool.render(model, request_at(time), str(time))).data)
 
     async def all_at_once() -> None:
         async with anyio.create_task_group() as group:
@@ -270,7 +294,7 @@ def test_the_last_images_are_kept_up_to_a_number_of_bytes(trained: Path) -> None
 
     async def images(kept_bytes: int, times: Sequence[float]) -> list[bytes]:
         pool = RenderPool(slots=1, kept_bytes=kept_bytes)
-        rendered = [await pool.render(model, request_at(time), str(time)) for time in times]
+        rendered = [(await pool.render(model, request_at(time), str(time))).data for time in times]
         pool.close()
         return rendered
 
@@ -289,7 +313,7 @@ def test_an_image_that_cannot_be_rendered_is_tried_again(trained: Path) -> None:
     wrong = replace(request_at(0.0), background=(1.0, 1.0, math.nan))
 
     async def send(request: RenderRequest) -> bytes:
-        return await pool.render(model, request, "key")
+        return (await pool.render(model, request, "key")).data
 
     with pytest.raises(ValueError, match="finite"):
         anyio.run(send, wrong)

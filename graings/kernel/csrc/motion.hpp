@@ -54,4 +54,26 @@ static void move_children(const MoveArgs<R>& args, int64_t begin, int64_t end) {
     }
 }
 
+// Blocks [begin, end) of BlendArgs.
+template <class R>
+static void blend_children(const BlendArgs<R>& args, int64_t begin, int64_t end) {
+    constexpr int N = kNative<R>;
+    R values[kBlended][kMoving];
+    for (int64_t block = begin; block < end; block++) {
+        for (int lane = 0; lane < kMoving; lane += N) {
+            Vec<R, N> sum[kBlended];
+            for (int c = 0; c < kBlended; c++) sum[c] = load<N>(args.state + (block * kBlended + c) * kMoving + lane);
+            for (int64_t k = args.begin[block]; k < args.begin[block + 1]; k++) {
+                const auto weight = load<N>(args.weights + k * kMoving + lane);
+                const R* function = args.functions + args.units[k] * kBlended;
+                for (int c = 0; c < kBlended; c++) sum[c] = fma(weight, splat<R, N>(function[c]), sum[c]);
+            }
+            for (int c = 0; c < kBlended; c++) store(values[c] + lane, sum[c]);
+        }
+        R* out = args.out + block * kMoving * kBlended;
+        for (int i = 0; i < kMoving; i++)
+            for (int c = 0; c < kBlended; c++) out[i * kBlended + c] = values[c][i];
+    }
+}
+
 }  // namespace graings::GRAINGS_ISA

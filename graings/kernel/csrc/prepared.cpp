@@ -93,6 +93,7 @@ int64_t choose(const Shown<R>& in, int64_t slots, const Rendered<R>& out, int th
             const int64_t slot = in.slots[r];
             if (slot < 0 || slot >= slots) throw std::invalid_argument("slots must have an opacity");
             score[r - begin] = in.opacities[slot];
+            if (in.blended) score[r - begin] += in.blended[kBlended * r + 3];
             if (in.change) changes[r - begin] = in.change[slot * stride + stride - 1];
         }
         if (in.change) {
@@ -107,10 +108,16 @@ int64_t choose(const Shown<R>& in, int64_t slots, const Rendered<R>& out, int th
         for (int64_t r = begin; r < end; r++) {
             if (!(scores[size_t(r)] > threshold)) continue;
             out.rows[at] = r, out.slots[at] = in.slots[r], out.children[at] = in.children[r], out.uids[at] = in.uids[r];
+            if (out.changes) std::copy_n(in.blended + kBlended * r, 3, out.changes + 3 * at);
             out.opacities[at++] = scores[size_t(r)];
         }
     });
     return before.back();
+}
+
+template <class R>
+void blend(const BlendArgs<R>& args, int64_t blocks, int threads) {
+    in_pieces(threads, blocks, kPiece / kMoving, [&](int, int64_t begin, int64_t end) { kernels<R>().blend_children(args, begin, end); });
 }
 
 template <class R>
@@ -147,6 +154,12 @@ void paint(const ColorNetworks<R>& in, const double* eye, double nearest, int64_
             if (seen) std::copy_n(seen + 3 * at, 3, change + i);
             else if (in.time_only) std::copy_n(in.time_only + 4 * *child, 3, change + i);
         }
+        if (in.blended) {
+            const R* added = in.blended + (out - colors);
+            kernels<R>().activate(kSigmoid, 3 * (to - from), out, out);
+            for (int64_t i = 0; i < 3 * (to - from); i++) out[i] = std::min(std::max(out[i] + added[i], R(0)), R(1));
+            return;
+        }
         kernels<R>().finish_colors(3 * (to - from), R(in.bound), seen || in.time_only ? change : nullptr, out);
     });
 }
@@ -155,6 +168,7 @@ void paint(const ColorNetworks<R>& in, const double* eye, double nearest, int64_
     template void activate<R>(Activation, int64_t, const R*, R*, int);                           \
     template void directions<R>(int64_t, const R*, const double*, double, R*, int);              \
     template int64_t choose<R>(const Shown<R>&, int64_t, const Rendered<R>&, int);                        \
+    template void blend<R>(const BlendArgs<R>&, int64_t, int);                                   \
     template void move<R>(const MoveArgs<R>&, int64_t, int64_t, int);                            \
     template void paint<R>(const ColorNetworks<R>&, const double*, double, int64_t, const int64_t*, R*, int);
 GRAINGS_INSTANTIATE(float)

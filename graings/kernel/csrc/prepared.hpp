@@ -24,17 +24,23 @@ struct Shown {
     const R* opacities;                      // [slots of all kept anchors]: canonical scores
     Network<R> residual;                     // no inputs but `shared` -> values of each slot, the last for its score; or empty
     R* change;                               // [anchors, outputs of `residual`]: written; null if there is none
+    const R* blended;                        // [count, kBlended] instead of `residual`: added without a bound; or null
     double bound, threshold;                 // eta; scores up to `threshold` are not rendered
 };
+
+// Values [blocks, kMoving, kBlended] of a motion basis.
+template <class R>
+void blend(const BlendArgs<R>&, int64_t blocks, int threads);
 
 // The rendered rows in ascending order, at the front of arrays of `count`.
 template <class R>
 struct Rendered {
     int64_t *rows, *slots, *children, *uids;
     R* opacities;
+    R* changes;  // [count, 3]: the colours of `blended`; null if there are none
 };
 
-// Selects the rows whose score, opacity + bound tanh(change), exceeds the threshold; returns their number.
+// Selects the rows whose score, opacity + bound tanh(change) or opacity + blended, exceeds the threshold; returns their number.
 // Throws std::invalid_argument for a slot without an opacity.
 template <class R>
 int64_t choose(const Shown<R>&, int64_t slots, const Rendered<R>&, int threads);
@@ -53,6 +59,7 @@ struct ColorNetworks {
     int residual_degree;          // of those that `residual` receives; 0: there is no such network
     Network<R> residual;          // encoded directions -> [3 slots], before its bound
     const R* time_only;           // [anchors, slots, 4] without `residual`: colour, opacity; or null
+    const R* blended;             // [drawn, 3] instead of both: a change that has its bound already; or null
     double bound;                 // eta
 };
 

@@ -39,10 +39,14 @@ void bind(nb::module_& m) {
         graings::directions<R>(int64_t(rows), position.data(), from, nearest, to, threads);
     });
     m.def("choose", [](In<int64_t> slots, In<int64_t> children, In<int64_t> uids, In<R> opacities, std::optional<In<R>> hidden, std::vector<In<R>> weights,
-                       std::vector<In<R>> biases, std::optional<Out<R>> change, double bound, double threshold, Out<int64_t> out_rows, Out<int64_t> out_slots,
-                       Out<int64_t> out_children, Out<int64_t> out_uids, Out<R> out_opacities, int threads) {
+                       std::vector<In<R>> biases, std::optional<Out<R>> change, std::optional<In<R>> blended, double bound, double threshold, Out<int64_t> out_rows,
+                       Out<int64_t> out_slots, Out<int64_t> out_children, Out<int64_t> out_uids, Out<R> out_opacities, std::optional<Out<R>> out_changes, int threads) {
         const size_t count = slots.size();
-        graings::Shown<R> in{int64_t(count), 0, slots.data(), checked(children, count, "children"), checked(uids, count, "uids"), opacities.data(), {}, nullptr, bound, threshold};
+        graings::Shown<R> in{int64_t(count), 0, slots.data(), checked(children, count, "children"), checked(uids, count, "uids"), opacities.data(), {}, nullptr, nullptr, bound, threshold};
+        if (blended) {
+            if (blended->size() < count * graings::kBlended) throw std::invalid_argument("blended must have four values for each slot");
+            in.blended = blended->data();
+        }
         if (hidden && change) {
             in.anchors = int64_t(hidden->shape(0));
             in.residual = head(*hidden, in.anchors, weights, biases, 0);
@@ -50,9 +54,21 @@ void bind(nb::module_& m) {
             if (opacities.size() && change->size() % opacities.size()) throw std::invalid_argument("change must have the same number of values for each slot");
         }
         const graings::Rendered<R> out{checked(out_rows, count, "rows"), checked(out_slots, count, "slots"), checked(out_children, count, "children"),
-                                       checked(out_uids, count, "uids"), checked(out_opacities, count, "opacities")};
+                                       checked(out_uids, count, "uids"), checked(out_opacities, count, "opacities"),
+                                       blended ? checked(out_changes, 3 * count, "changes") : nullptr};
         nb::gil_scoped_release release;
         return graings::choose<R>(in, int64_t(opacities.size()), out, threads);
+    });
+    m.def("blend", [](In<R> weights, In<int64_t> begin, In<int32_t> units, In<R> state, In<R> functions, Out<R> out, int threads) {
+        const size_t blocks = state.size() / (graings::kBlended * graings::kMoving), rank = functions.size() / graings::kBlended;
+        const int64_t* starts = checked(begin, blocks + 1, "begin");
+        if (starts[0] != 0 || !std::is_sorted(starts, starts + blocks + 1)) throw std::invalid_argument("begin must ascend from 0");
+        const int32_t* numbers = checked(units, size_t(starts[blocks]), "units");
+        if (units.size() && size_t(*std::max_element(numbers, numbers + units.size())) >= rank) throw std::invalid_argument("units must be functions");
+        const graings::BlendArgs<R> args{checked(weights, units.size() * graings::kMoving, "weights"), starts, numbers, state.data(), functions.data(),
+                                         checked(out, state.size(), "out")};
+        nb::gil_scoped_release release;
+        graings::blend<R>(args, int64_t(blocks), threads);
     });
     m.def("move", [](In<R> hidden, In<int64_t> begin, In<int32_t> units, In<R> rest, In<R> weights, In<R> bias, double extent, double change, double low, double high,
                      In<int64_t> rows, Out<R> mean, Out<R> quat, Out<R> log_scale, int threads) {
@@ -83,9 +99,9 @@ void bind(nb::module_& m) {
     });
     m.def("paint", [](In<R> position, std::optional<In<R>> normals, int degree, In<R> hidden, std::vector<In<R>> weights, std::vector<In<R>> biases, int residual_degree,
                       std::optional<In<R>> residual_hidden, std::vector<In<R>> residual_weights, std::vector<In<R>> residual_biases, std::optional<In<R>> time_only,
-                      double bound, In<double> eye, double nearest, In<int64_t> children, Out<R> colors, int threads) {
+                      std::optional<In<R>> blended, double bound, In<double> eye, double nearest, In<int64_t> children, Out<R> colors, int threads) {
         const int64_t anchors = int64_t(position.size() / 3);
-        graings::ColorNetworks<R> in{anchors, 0, position.data(), checked(normals, position.size(), "normals"), degree, {}, residual_degree, {}, nullptr, bound};
+        graings::ColorNetworks<R> in{anchors, 0, position.data(), checked(normals, position.size(), "normals"), degree, {}, residual_degree, {}, nullptr, nullptr, bound};
         in.canonical = head(hidden, anchors, weights, biases, harmonics_of(degree) * (normals ? 2 : 1));
         in.slots = in.canonical.widths[2] / 3;
         if (in.canonical.widths[2] != 3 * in.slots) throw std::invalid_argument("a colour network has three outputs per slot");
@@ -95,6 +111,7 @@ void bind(nb::module_& m) {
             if (in.residual.widths[2] != 3 * in.slots) throw std::invalid_argument("colour and residual must have the same slots");
         }
         in.time_only = checked(time_only, size_t(4 * anchors * in.slots), "time_only");
+        in.blended = checked(blended, 3 * children.size(), "blended");
         const double* from = checked(eye, 3, "eye");
         R* out = checked(colors, 3 * children.size(), "colors");
         nb::gil_scoped_release release;

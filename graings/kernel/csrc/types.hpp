@@ -185,6 +185,7 @@ struct NetworkArgs {
 
 constexpr int kMoving = 16;    // children per block of the arrays of MoveArgs
 constexpr int kOffsets = 10;   // outputs of DeformNet: position 3, rotation 4, log-scale 3
+constexpr int kBlended = 4;    // values of BlendArgs: colour 3, opacity
 enum Activation : int { kSigmoid, kTanh };
 
 // Children whose offsets in time are weights [width, kOffsets] times hidden units plus `bias`, in blocks of kMoving
@@ -201,6 +202,17 @@ struct MoveArgs {
     R *mean, *quat, *log_scale;      // in the order of `rows`
 };
 
+// Values of children that are `state` plus weights times `functions` [rank, kBlended], in blocks as in MoveArgs: rows of
+// `weights` hold a number for each child of a block, those of block b are begin[b] to begin[b + 1], of the functions `units`.
+template <class R>
+struct BlendArgs {
+    const R* weights;  // [weights of all blocks, kMoving]
+    const int64_t* begin;
+    const int32_t* units;
+    const R *state, *functions;  // state: [blocks, kBlended, kMoving]
+    R* out;                      // [blocks, kMoving, kBlended]
+};
+
 // The functions compiled once per instruction set.
 template <class R>
 struct Kernels {
@@ -215,6 +227,7 @@ struct Kernels {
     void (*activate)(Activation, int64_t count, const R* x, R* out);
     void (*finish_colors)(int64_t count, R bound, const R* residual, R* colors);  // residual may be null
     void (*move_children)(const MoveArgs<R>&, int64_t begin, int64_t end);
+    void (*blend_children)(const BlendArgs<R>&, int64_t begin, int64_t end);  // blocks
 };
 
 constexpr int kChunk = 64;  // entries of a tile prepared at a time in the forward pass
