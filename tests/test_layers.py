@@ -82,14 +82,17 @@ HOMES: dict[str, tuple[str, ...]] = {
     "starlette": ("service",),
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
+    "limits": ("service.request_limits",),
     "typer": (
         *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.synthesize"),
         *("graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
+        "service.key_commands",
     ),
     "rich": (
         *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.progress"),
         "graings.cli.synthesize",
         *("graings.cli.terminal", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
+        "service.key_commands",
     ),
     "OpenImageIO": ("graings.capture", "graings.image_encoding"),
     "pycolmap": ("graings.capture", "graings.training.initialization"),
