@@ -68,13 +68,14 @@ class JobConflict(JobError):
 class JobSpec:
     """A submitted job. `capture` is the SHA-256 of the uploaded archive, `config` a whole `TrainConfig` as JSON.
 
-    Jobs with a lower `priority` start first.
+    Jobs with a lower `priority` start first. `owner` is the key that submitted it; None for nobody's.
     """
 
     name: str
     capture: str
     config: dict[str, Any]
     priority: int = 10
+    owner: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

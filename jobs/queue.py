@@ -7,7 +7,9 @@ operations its state allows. It has no state of its own: any number of processes
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Collection
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -59,16 +61,37 @@ class JobQueue:
         """Raises `JobNotFound`."""
         return self._job(job_id, self._engine.entries([job_id]).get(job_id))
 
-    def page(self, limit: int, after: str | None = None) -> tuple[list[Job], str | None]:
-        """Jobs older than `after`, newest first, at most `limit`; and the id for the next page, if there are more."""
-        ids = [job_id for job_id in self.store.ids() if after is None or job_id < after]
-        page = ids[:limit]
-        entries = self._engine.entries(page)
-        jobs = []
-        for job_id in page:
-            with suppress(JobNotFound):  # deleted meanwhile
-                jobs.append(self._job(job_id, entries.get(job_id)))
-        return jobs, (page[-1] if len(ids) > limit else None)
+    def page(
+        self,
+        limit: int,
+        after: str | None = None,
+        *,
+        wanted: Callable[[str, JobSpec], bool] = lambda job_id, spec: True,
+        states: Collection[JobState] = (),
+    ) -> tuple[list[Job], str | None]:
+        """Jobs older than `after`, newest first, at most `limit`; and the id for the next page, if there may be more.
+
+        Only jobs whose id and specification are `wanted`, in one of `states` unless that is empty.
+        """
+        ids = iter([job_id for job_id in self.store.ids() if after is None or job_id < after])
+        jobs: list[Job] = []
+        while batch := list(islice((job_id for job_id in ids if wanted(job_id, self.spec(job_id))), limit + 1)):
+            entries = self._engine.entries(batch)
+            for job_id in batch:
+                with suppress(JobNotFound):  # deleted meanwhile
+                    job = self._job(job_id, entries.get(job_id))
+                    if not states or job.state in states:
+                        jobs.append(job)
+            if len(jobs) > limit:
+                break
+        return jobs[:limit], (jobs[limit - 1].id if len(jobs) > limit else None)
+
+    def spec(self, job_id: str) -> JobSpec:
+        """The specification, or `UNREADABLE_SPEC` for a job that is damaged or was deleted."""
+        try:
+            return self.store.folder(job_id).spec()
+        except (JobDamaged, JobNotFound):
+            return UNREADABLE_SPEC
 
     def cancel(self, job_id: str) -> Job:
         """Stop a queued or running job; it keeps its checkpoint. A cancelled job does not change."""

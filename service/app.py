@@ -7,17 +7,19 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from anyio import to_thread
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 
 import graings
 from graings.kernel import use_threads
 from service import problems
+from service.access import authorize
 from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
-from service.routes import jobs, plans, render, results, system
+from service.routes import jobs, plans, render, results, sessions, system
 from service.same_origin import SameOrigin
+from service.security_headers import SecurityHeaders
 from service.settings import Settings
 
 _SMALL_BODY = 64 * 1024
@@ -49,13 +51,19 @@ def create_app(settings: Settings) -> FastAPI:
         version=graings.__version__,
         summary="See a moving scene from anywhere, at any time, with nothing but a CPU.",
         lifespan=lifespan,
+        docs_url=None,  # its own page loads scripts from other sites
+        redoc_url=None,
     )
     app.add_middleware(BodyLimit, limit=limit)
     app.add_middleware(SameOrigin, allowed_hosts=settings.allowed_host_names)
     problems.install(app)
     # Added last, so that it comes first: a refused request costs next to nothing.
     app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
-    for routes in (jobs, plans, results, render, system):
-        app.include_router(routes.router)
+    app.add_middleware(SecurityHeaders)
+    for routes in (jobs, plans, results, render, sessions, system):
+        app.include_router(routes.router, dependencies=[Depends(authorize)])
+    for routes in (sessions, system):
+        app.include_router(routes.open_router)
+    app.mount("/web/swagger", StaticFiles(packages=[("fastapi_swagger", "resources")]), name="swagger")
     app.mount("/web", StaticFiles(directory=system.WEB), name="web")
     return app

@@ -18,6 +18,7 @@ from jobs.job import JobError
 from jobs.parent import watch_parent
 from jobs.store import Store
 from service.app import create_app
+from service.keys import Keys
 from service.settings import Settings
 from service.worker_child import WorkerChild
 
@@ -53,6 +54,13 @@ def serve(
     except (OSError, JobError) as error:
         typer.echo(f"serve: {error}. Choose another --data or --database.", err=True)
         raise typer.Exit(1) from error
+    if not settings.is_local and not any(key.valid for key in Keys(settings.data / "keys").all()):
+        typer.echo(
+            f"serve: other machines can reach {settings.host}, and there is no key. Make one first: "
+            f"graings keys create --scope admin --name NAME --data {settings.data}",
+            err=True,
+        )
+        raise typer.Exit(2)
     server = uvicorn.Server(
         uvicorn.Config(
             create_app(settings),

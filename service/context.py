@@ -13,7 +13,9 @@ from jobs.lease import Leases, open_leases
 from jobs.queue import JobQueue
 from jobs.store import Store, discard_leftovers
 from service.archives import Limits
+from service.keys import Keys
 from service.rendering import ModelCache, RenderPool
+from service.request_limits import RequestLimits
 from service.settings import Settings
 
 MB = 1_000_000
@@ -30,11 +32,18 @@ class Context:
     leases: Leases
     models: ModelCache
     pool: RenderPool
+    keys: Keys
+    request_limits: RequestLimits
 
     @property
     def limits(self) -> Limits:
         """Limits of an unpacked upload."""
         return Limits(self.settings.max_files, self.settings.max_unpacked_mb * MB)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether requests need no key: no other machine can send one, and nobody has made a key."""
+        return self.settings.is_local and not self.keys.exist()
 
     def free_mb(self) -> int:
         """Free space in the data folder."""
@@ -61,6 +70,8 @@ def open_context(settings: Settings) -> Context:
         leases=open_leases(settings.database_url, store.workers),
         models=ModelCache(settings.models_mb * MB),
         pool=RenderPool(settings.images_at_once, settings.images_mb * MB),
+        keys=Keys(store.root / "keys"),
+        request_limits=RequestLimits(settings.key_requests, settings.key_open_requests),
     )
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 import errno
 import json
 import logging
+import math
+import time
+from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Any, ClassVar
+from types import MappingProxyType
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -38,7 +42,37 @@ class Problem(BaseModel):
 class ServiceError(Exception):
     """Base class of the errors of the service itself."""
 
-    headers: ClassVar[dict[str, str] | None] = None
+    headers: Mapping[str, str] = MappingProxyType({})
+
+
+class Unauthorized(ServiceError):
+    """The request has no key, or a wrong one."""
+
+    def __init__(self, wrong: bool) -> None:
+        super().__init__(
+            "This key or session is wrong, revoked or expired. `graings keys list` on the machine of the service shows "
+            "the valid ones."
+            if wrong
+            else "This needs a key: send Authorization: Bearer KEY. `graings keys create` on the machine of the "
+            "service makes one."
+        )
+        self.headers = {"WWW-Authenticate": 'Bearer realm="graings"' + ', error="invalid_token"' * wrong}
+
+
+class Forbidden(ServiceError):
+    """The key is right, but does not allow this."""
+
+    def __init__(self, message: str, needed: str) -> None:
+        super().__init__(message)
+        self.headers = {"WWW-Authenticate": f'Bearer realm="graings", error="insufficient_scope", scope="{needed}"'}
+
+
+class TooManyRequests(ServiceError):
+    """A key has used up what it may send; `until` is when it may send again, in Unix seconds."""
+
+    def __init__(self, message: str, until: float = 0.0) -> None:
+        super().__init__(message)
+        self.headers = {"Retry-After": str(max(1, math.ceil(until - time.time())))}
 
 
 class BadRequest(ServiceError):
@@ -52,7 +86,7 @@ class ArchiveError(ServiceError):
 class TooLarge(ServiceError):
     """A body is larger than the limit."""
 
-    headers: ClassVar[dict[str, str] | None] = {"Connection": "close"}  # the rest of the body is not read
+    headers = MappingProxyType({"Connection": "close"})  # the rest of the body is not read
 
 
 class NotYet(ServiceError):
@@ -73,6 +107,9 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (ArchiveError, 422, "capture-rejected"),
     (TooLarge, 413, "too-large"),
     (NotYet, 404, "not-yet"),
+    (Unauthorized, 401, "no-key"),
+    (Forbidden, 403, "not-allowed"),
+    (TooManyRequests, 429, "too-many-requests"),
     (NotAcceptable, 406, "not-acceptable"),
     (ClientDisconnect, 400, "disconnected"),
     (ConfigError, 422, "bad-config"),
@@ -109,7 +146,7 @@ def problem(
     *,
     kind: str | None = None,
     errors: list[dict[str, Any]] | None = None,
-    headers: dict[str, str] | None = None,
+    headers: Mapping[str, str] | None = None,
 ) -> Response:
     """A problem document as a response."""
     document = Problem(
@@ -134,9 +171,7 @@ def install(app: FastAPI) -> None:
             # A file name may contain lone surrogates, which a log in UTF-8 cannot.
             message = str(error).encode("utf-8", "backslashreplace").decode()
             LOG.error("%s %s: %s", request.method, request.url.path, message)
-        headers = error.headers if isinstance(error, ServiceError) else None
-        if status == 503 and headers is None:
-            headers = RETRY_LATER
+        headers = error.headers if isinstance(error, ServiceError) else RETRY_LATER if status == 503 else None
         return problem(request, status, str(error), kind=kind, headers=headers)
 
     async def http(request: Request, error: Exception) -> Response:

@@ -2,8 +2,8 @@
 
 A page of any site can make a browser send requests to a service on its own machine; the header `Origin` names that
 site, and scripts send none. A site can also resolve its own name to this machine (DNS rebinding), so that its page is
-of the same origin; the header `Host` then has that name. The service has no authentication: these two checks prevent
-such pages from reading, starting and deleting jobs.
+of the same origin; the header `Host` then has that name. On its own machine the service needs no key: these two checks
+prevent such pages from reading, starting and deleting jobs.
 """
 
 from __future__ import annotations

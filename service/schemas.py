@@ -96,9 +96,9 @@ def job_summary(job: Job) -> JobSummary:
         name=job.spec.name,
         state=job.state,
         priority=job.spec.priority,
-        created_at=_moment(job.created_at),
-        started_at=None if job.started_at is None else _moment(job.started_at),
-        finished_at=None if job.finished_at is None else _moment(job.finished_at),
+        created_at=moment(job.created_at),
+        started_at=None if job.started_at is None else moment(job.started_at),
+        finished_at=None if job.finished_at is None else moment(job.finished_at),
         attempts=job.attempts,
         progress=job.progress,
         checkpoint=job.checkpoint,
@@ -107,5 +107,6 @@ def job_summary(job: Job) -> JobSummary:
     )
 
 
-def _moment(seconds: float) -> datetime:
+def moment(seconds: float) -> datetime:
+    """Unix seconds as a date."""
     return datetime.fromtimestamp(seconds, UTC)

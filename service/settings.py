@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from ipaddress import ip_address
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -22,7 +23,7 @@ class Settings(BaseModel):
 
     data: Path = Field(Path("data"), description="Folder with captures and jobs.")
     database: str | None = Field(None, description="sqlite:///… or postgresql://…; null: SQLite in the data folder.")
-    host: str = Field("127.0.0.1", description="Address to listen on. There is no authentication: keep it local.")
+    host: str = Field("127.0.0.1", description="Address to listen on. One that other machines can reach needs a key.")
     allowed_hosts: str = Field(
         "localhost",
         description="Host names of the service, besides IP addresses, separated by commas; * for any. Others are "
@@ -42,11 +43,23 @@ class Settings(BaseModel):
         16, ge=0, le=1_000, description="Requests for images that may wait; further ones get 503."
     )
     render_threads: int = Field(1, ge=1, le=256, description="CPU threads per image.")
+    key_requests: int = Field(3_000, ge=1, description="Requests that a key may send in a minute.")
+    key_open_requests: int = Field(64, ge=1, description="Requests of a key, event streams included, at a time.")
 
     @property
     def database_url(self) -> str:
         """The URL of the database, which is in the data folder by default."""
         return self.database or default_database(self.data)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether no other machine can reach `host`."""
+        if self.host.lower() == "localhost":
+            return True
+        try:
+            return ip_address(self.host).is_loopback
+        except ValueError:  # a name, which may be of any address
+            return False
 
     @property
     def images_at_once(self) -> int:

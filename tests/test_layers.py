@@ -84,15 +84,9 @@ HOMES: dict[str, tuple[str, ...]] = {
     "starlette": ("service",),
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
-    "typer": (
-        *("graings.cli.footage", "graings.cli.main", "graings.cli.option_table", "graings.cli.planning"),
-        *("graings.cli.synthesize", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
-    ),
-    "rich": (
-        *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.progress"),
-        *("graings.cli.footage", "graings.cli.synthesize"),
-        *("graings.cli.terminal", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
-    ),
+    "limits": ("service.request_limits",),
+    "typer": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
+    "rich": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
     "OpenImageIO": ("graings.capture", "graings.footage.photos", "graings.image_encoding"),
     "pycolmap": ("graings.capture", "graings.footage", "graings.training.initialization"),
     "av": ("graings.footage.video",),

@@ -256,7 +256,10 @@ def _package_command(entry: EntryPoint) -> Any:
     """The command of an entry point; if it cannot be imported, one that fails with the reason when it is used."""
     group = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     try:
-        group.command(entry.name)(entry.load())
+        command = entry.load()
+        if isinstance(command, typer.Typer):
+            return typer.main.get_command(command)
+        group.command(entry.name)(command)
     except ImportError as error:
         reason = str(error)
         remedy = " Install what is missing." if isinstance(error, ModuleNotFoundError) else ""

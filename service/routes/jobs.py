@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from graings.config import PRESETS, make_config
 from jobs.job import ID_PATTERN, JobSpec
+from service.access import CallerDep
 from service.context import ContextDep, JobId
 from service.inspection import inspect_capture
 from service.problems import RESPONSES
@@ -26,6 +27,7 @@ async def submit(
     request: Request,
     response: Response,
     context: ContextDep,
+    caller: CallerDep,
     preset: Annotated[str, Query(description=f"Source of default values: {', '.join(PRESETS)}.")] = "standard",
     config: Annotated[
         str | None, Query(description="Options as a JSON object, nested or with dotted keys, see /options.")
@@ -40,7 +42,7 @@ async def submit(
     async with receive_capture(request, context.store.uploads, context.limits) as upload:
         chosen = make_config(preset, {**overrides, **upload.config})
         await inspect_capture(upload.folder, chosen.capture)
-        spec = JobSpec(name=name, capture=upload.digest, config=chosen.model_dump(mode="json"), priority=priority)
+        spec = JobSpec(name, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner)
         job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder)
     response.headers["Location"] = f"/jobs/{job.id}"
     response.headers["Retry-After"] = RETRY_AFTER_S
@@ -50,11 +52,12 @@ async def submit(
 @router.get("", operation_id="list_jobs")
 def page(
     context: ContextDep,
+    caller: CallerDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(pattern=ID_PATTERN, description="From `next` of the previous page.")] = None,
 ) -> JobPage:
     """Jobs, newest first."""
-    jobs, after = context.jobs.page(limit, cursor)
+    jobs, after = context.jobs.page(limit, cursor, wanted=caller.sees)
     following = None if after is None else "/jobs?" + urlencode({"limit": limit, "cursor": after})
     return JobPage(jobs=[job_summary(job) for job in jobs], next=following)
 

@@ -24,6 +24,7 @@ from graings.errors import CheckpointError
 from graings.image_encoding import FORMATS, MEDIA_TYPES, ImageFormat
 from graings.storage.model import Model
 from jobs.job import JobNotFound
+from service.access import Caller, CallerDep
 from service.context import Context, ContextDep
 from service.problems import RESPONSES, BadRequest, NotAcceptable, NotYet
 from service.rendering import LoadedModel, RenderRequest
@@ -67,7 +68,7 @@ class RenderQuery(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    job: str | None = Field(None, max_length=64, description="Job of the model; by default the newest that has one.")
+    job: str | None = Field(None, max_length=64, description="Job of the model; by default your newest that has one.")
     t: float | None = Field(
         None, description="Time in [0, 1], clamped. Default: that of the view named by `camera`, else 0."
     )
@@ -106,13 +107,14 @@ class RenderQuery(BaseModel):
 async def render(
     query: Annotated[RenderQuery, Query()],
     context: ContextDep,
+    caller: CallerDep,
     accept: Annotated[str | None, Header()] = None,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
     """Render the newest model, or a job's newest checkpoint while it trains, at time `t` from a viewpoint."""
     started = perf_counter()
     format = query.format or _format(accept)
-    job_id, loaded = await to_thread.run_sync(_model, context, query.job)
+    job_id, loaded = await to_thread.run_sync(_model, context, caller, query.job)
     model = loaded.model
     try:
         view = _view_request(query)
@@ -157,8 +159,8 @@ def _format(accept: str | None) -> ImageFormat:
     return offered[media_type]
 
 
-def _model(context: Context, job_id: str | None) -> tuple[str, LoadedModel]:
-    """The model of a job, or of the newest job that has one. Blocks."""
+def _model(context: Context, caller: Caller, job_id: str | None) -> tuple[str, LoadedModel]:
+    """The model of a job, or of the newest of the caller's that has one. Blocks."""
     if job_id is not None:
         model = context.models.load(context.store.folder(job_id).run)
         if model is None:
@@ -166,6 +168,8 @@ def _model(context: Context, job_id: str | None) -> tuple[str, LoadedModel]:
         return job_id, model
     damaged: CheckpointError | None = None
     for candidate in context.store.ids():
+        if not caller.sees(candidate, context.jobs.spec(candidate)):
+            continue
         try:
             model = context.models.load(context.store.folder(candidate).run)
         except JobNotFound:

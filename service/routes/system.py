@@ -15,13 +15,9 @@ from service.problems import RESPONSES, RETRY_LATER, problem
 from service.schemas import OptionsResource, Readiness
 
 WEB = Path(__file__).resolve().parent.parent / "web"
-PAGE_HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; style-src 'self'; base-uri 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-}
 
 router = APIRouter(tags=["system"])
+open_router = APIRouter(tags=["system"])  # for everybody, also without a key
 
 
 @router.get("/options", operation_id="get_options")
@@ -36,13 +32,13 @@ def _options() -> OptionsResource:
     return OptionsResource.model_validate({**options(), "scenes": scenes})
 
 
-@router.get("/healthz", operation_id="get_health")
+@open_router.get("/healthz", operation_id="get_health")
 async def health() -> dict[str, str]:
     """The process runs."""
     return {"status": "ok"}
 
 
-@router.get("/readyz", operation_id="get_readiness", response_model=Readiness, responses=RESPONSES)
+@open_router.get("/readyz", operation_id="get_readiness", response_model=Readiness, responses=RESPONSES)
 def readiness(request: Request, context: ContextDep) -> Readiness | Response:
     """The database answers and the disk has room."""
     workers, waiting, free_mb = context.leases.alive(), context.jobs.waiting(), context.free_mb()
@@ -52,7 +48,13 @@ def readiness(request: Request, context: ContextDep) -> Readiness | Response:
     return Readiness(ready=True, workers=workers, waiting=waiting, free_mb=free_mb)
 
 
-@router.get("/", include_in_schema=False)
+@open_router.get("/", include_in_schema=False)
 async def page() -> Response:
     """The web page."""
-    return FileResponse(WEB / "index.html", headers=PAGE_HEADERS)
+    return FileResponse(WEB / "index.html")
+
+
+@open_router.get("/docs", include_in_schema=False)
+async def documentation() -> Response:
+    """The page that describes every request and tries it."""
+    return FileResponse(WEB / "docs.html")

@@ -22,6 +22,43 @@ async function request(path, options) {
   return body;
 }
 
+// ---- the session, if the service needs a key
+
+let session = { scope: "admin", name: null };
+
+async function signIn(secret) {
+  await request("/session", { method: "POST", headers: { Authorization: `Bearer ${secret}` } });
+  location.replace("/");
+}
+
+async function start() {
+  const link = location.hash.match(/^#link=(.+)$/);
+  try {
+    if (link) return await signIn(link[1]);
+    session = await request("/session");
+  } catch (error) {
+    document.querySelector("main").hidden = true;
+    $("signin").hidden = false;
+    if (link) $("signin").querySelector("[role=alert]").textContent = error.message;
+    return;
+  }
+  $("upload").hidden = !may("train");
+  document.body.classList.toggle("guest", !may("read"));
+  $("signout").hidden = session.name === null;
+  $("signout").textContent = `Sign out ${session.name}`;
+  refresh();
+}
+
+const may = (scope) => ["view", "read", "train", "admin"].indexOf(session.scope) >= ["view", "read", "train", "admin"].indexOf(scope);
+
+$("signin").onsubmit = (event) => {
+  event.preventDefault();
+  signIn(event.target.elements.key.value.trim()).catch((error) => {
+    event.target.querySelector("[role=alert]").textContent = error.message;
+  });
+};
+$("signout").onclick = () => request("/session", { method: "DELETE" }).then(() => location.replace("/"), showError);
+
 // ---- jobs
 
 async function list() {
@@ -136,7 +173,9 @@ function showJob(job) {
   $("numbers").replaceChildren(...rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]));
 
   const verbs = ["cancel", "resume", "retry"].filter((verb) => job.links[verb]);
+  $("actions").hidden = !may("train");
   const buttons = verbs.map((verb) => action(verb, () => request(job.links[verb], { method: "POST" })));
+  if (may("train")) buttons.push(action("share", () => share(job)));
   if (job.state !== "running") {
     buttons.push(action("delete", async () => {
       if (!confirm(`Delete "${job.name}" with its model?`)) return;
@@ -152,15 +191,20 @@ function showJob(job) {
   }
   const curve = $("curve");
   const stamp = `${job.links.curve}?${Math.floor(report.train_s / 10)} ${job.state}`;
-  curve.hidden = !job.links.curve;
-  if (job.links.curve && curve.dataset.stamp !== stamp) {
+  curve.hidden = !job.links.curve || !may("read");
+  if (!curve.hidden && curve.dataset.stamp !== stamp) {
     curve.dataset.stamp = stamp;
     curve.src = `${job.links.curve}?at=${Date.now()}`;
   }
   const names = { model: "model", metrics: "metrics.json", report: "report", log: "log" };
   $("files").replaceChildren(
-    ...Object.entries(names).filter(([key]) => job.links[key]).map(([key, text]) => element("a", { href: job.links[key] }, text)),
+    ...Object.entries(names).filter(([key]) => job.links[key] && may("read")).map(([key, text]) => element("a", { href: job.links[key] }, text)),
   );
+}
+
+async function share(job) {
+  const link = await request(`${job.links.self}/links?name=page`, { method: "POST" });
+  prompt("Whoever has this address can look at the job until the link is revoked.", location.origin + link.address);
 }
 
 const eventText = (event) => event.message ?? event;
@@ -381,4 +425,4 @@ $("more").onclick = () => {
   pages += 1;
   list().catch(showError);
 };
-refresh();
+start();

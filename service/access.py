@@ -1,0 +1,116 @@
+"""Access: which caller may send which request. Every route but the open ones depends on `authorize`.
+
+A caller shows a key in `Authorization: Bearer`, or a browser the session it was given for one. Reading needs the scope
+`read` and everything else `train`, except for the operations in `NEEDS`. A job belongs to the key that made it: to
+others it does not exist. Without any key, a service that only this machine can reach lets everybody do everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+from fastapi import Depends, Request, Security
+from fastapi.routing import APIRoute
+from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
+
+from jobs.job import JobDamaged, JobNotFound, JobSpec
+from service.context import Context, ContextDep
+from service.keys import Key, Scope
+from service.problems import Forbidden, Unauthorized
+from service.same_origin import SAFE_METHODS
+
+COOKIE: Final = "graings_session"
+
+# Operations that need another scope than their method says.
+NEEDS: Final[dict[str, Scope]] = {
+    "get_job": Scope.VIEW,
+    "list_jobs": Scope.VIEW,
+    "get_events": Scope.VIEW,
+    "render": Scope.VIEW,
+}
+
+_bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key that `graings keys create` has shown.")
+_session = APIKeyCookie(
+    name=COOKIE, auto_error=False, scheme_name="session", description="What `POST /session` gives a browser for a key."
+)
+BearerDep = Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)]
+SessionDep = Annotated[str | None, Security(_session)]
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who sent a request: a key with its `owner`, the key that its jobs belong to; without a key anybody."""
+
+    key: Key | None = None
+    owner: str | None = None
+
+    @property
+    def scope(self) -> Scope:
+        return Scope.ADMIN if self.key is None else self.key.scope
+
+    def sees(self, job_id: str, spec: JobSpec) -> bool:
+        """Whether the job is one of the caller's."""
+        if self.key is None or self.scope is Scope.ADMIN:
+            return True
+        return job_id == self.key.job if self.key.job is not None else spec.owner == self.owner
+
+
+def identify(request: Request, context: Context, secret: str | None) -> Caller:
+    """The caller with this secret. Raises `Unauthorized`."""
+    key = None if secret is None else context.keys.find(secret)
+    if key is not None:
+        return Caller(key, context.keys.root(key))
+    # A wrong key is an error everywhere: who sends one does not want to act as anybody.
+    if "authorization" in request.headers or not context.is_open:
+        raise Unauthorized(secret is not None)
+    return Caller()
+
+
+def authorize(request: Request, context: ContextDep, header: BearerDep, session: SessionDep) -> Iterator[None]:
+    """Let the request pass if its caller may send it; the caller is then `request.state.caller`."""
+    caller = identify(request, context, header.credentials if header else session)
+    needed = _needed(request)
+    if not caller.scope.includes(needed):
+        raise Forbidden(f"This needs a key of scope {needed}, and this one has {caller.scope}.", needed)
+    by_session = header is None and caller.key is not None
+    # Browsers name the origin of every request that changes something, and SameOrigin compares it with the host.
+    if by_session and request.method not in SAFE_METHODS and "origin" not in request.headers:
+        raise Forbidden("A session is for pages of this service. Programs send Authorization: Bearer.", needed)
+    job_id = request.path_params.get("job_id") or request.query_params.get("job")
+    if job_id is not None and caller.scope is not Scope.ADMIN:
+        _check_job(context, caller, job_id)
+    request.state.caller = caller
+    if caller.key is None:
+        yield
+        return
+    name = caller.key.parent or caller.key.id  # all sessions of a key, or of a link, together
+    context.request_limits.begin(name)
+    try:
+        yield
+    finally:
+        context.request_limits.end(name)
+
+
+def _needed(request: Request) -> Scope:
+    route = request.scope.get("route")
+    name = route.operation_id if isinstance(route, APIRoute) else None
+    return NEEDS.get(name or "", Scope.READ if request.method in SAFE_METHODS else Scope.TRAIN)
+
+
+def _check_job(context: Context, caller: Caller, job_id: str) -> None:
+    try:
+        spec = context.store.folder(job_id).spec()
+    except JobDamaged as error:
+        raise JobNotFound(job_id) from error  # nobody knows whose it is
+    if not caller.sees(job_id, spec):
+        raise JobNotFound(job_id)
+
+
+def _caller_of(request: Request) -> Caller:
+    caller: Caller = request.state.caller
+    return caller
+
+
+CallerDep = Annotated[Caller, Depends(_caller_of)]
