@@ -160,7 +160,8 @@ def _open(path: Path, name: str) -> oiio.ImageInput:
 def _channels(spec: oiio.ImageSpec, name: str) -> tuple[list[int], int | None]:
     """Indices of the three colour channels (grey three times) and of alpha, or None."""
     names = list(spec.channelnames)
-    alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
+    last = names.index("A") if "A" in names else spec.alpha_channel  # the index is wrong for GIF
+    alpha = last if 0 <= last < len(names) else None
     if {"R", "G", "B"} <= set(names):
         return [names.index(c) for c in "RGB"], alpha
     if len(names) - (alpha is not None) == 1:
