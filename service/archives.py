@@ -20,12 +20,16 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
+from graings.capture.image_file import SUFFIXES as IMAGE_SUFFIXES
+from graings.capture.image_file import UNREADABLE_SUFFIXES
+from graings.capture.readers.foreign import MARKER_SUFFIXES
+from graings.capture.readers.rig import VIDEO_SUFFIXES
 from service.problems import ArchiveError
 
-# Suffixes of the files of a capture; all other files are skipped.
+# Suffixes of the files of a capture; all other files are skipped. What is recognised and not read is unpacked too: the
+# reader then gives the same reason as on the command line.
 _DATA = (".json", ".txt", ".ply", ".bin", ".npy", ".npz")
-_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".tif", ".tiff", ".bmp", ".tga", ".hdr")
-SUFFIXES = frozenset((*_DATA, *_IMAGES))
+SUFFIXES = frozenset((*_DATA, *IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES, *MARKER_SUFFIXES, *VIDEO_SUFFIXES))
 _CHUNK = 1 << 20
 _MAX_DEPTH = 16
 _MAX_NAME = 255

@@ -38,7 +38,7 @@ _FORM = {
 CAPTURE_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "The capture: transforms_*.json, transforms.json or COLMAP, packed as zip, tar or tar.gz.",
+        "description": "The capture, in one of the formats that are read from a folder, packed as zip, tar or tar.gz.",
         "content": {
             "application/zip": _BINARY,
             "application/x-tar": _BINARY,

@@ -6,9 +6,10 @@ Pixels of this colour then count as background, as transparent pixels do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graings.capture.capture import Capture, Frame
 from graings.capture.images import Image, ImageStore
@@ -43,10 +44,12 @@ def with_background(config: CaptureConfig, capture: Capture) -> CaptureConfig:
 def border_color(frames: Sequence[Frame], images: ImageStore) -> RGB | None:
     """The colour of nearly all border pixels of `frames`, in steps of 1/255; None where they differ.
 
-    Transparent pixels count with the background colour of `images`.
+    Transparent pixels count with the background colour of `images`, masked ones not at all.
     """
     sampled = np.unique(np.linspace(0, len(frames) - 1, SAMPLED_IMAGES).round().astype(int))
-    pixels = np.concatenate([_border_pixels(images.rgb(frames[index])) for index in sampled])
+    pixels = np.concatenate([_border_pixels(frames[index], images) for index in sampled])
+    if not len(pixels):
+        return None
     color = np.rint(np.median(pixels, axis=0).astype(np.float64) * 255) / 255
     if (np.abs(pixels - color).max(axis=-1) <= COLOR_TOLERANCE).mean() < MIN_BORDER_FRACTION:
         return None
@@ -54,6 +57,12 @@ def border_color(frames: Sequence[Frame], images: ImageStore) -> RGB | None:
     return red, green, blue
 
 
-def _border_pixels(image: Image) -> Image:
-    """The outermost pixels [N, 3] of an image [H, W, 3]."""
-    return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
+def _border_pixels(frame: Frame, images: ImageStore) -> Image:
+    """The outermost pixels [N, 3] of an image, without masked ones."""
+    valid, border = images.valid(frame), _border(images.rgb(frame))
+    return border if valid is None else border[_border(valid)]
+
+
+def _border(values: NDArray[Any]) -> NDArray[Any]:
+    """The outermost values [N, ...] of an array [H, W, ...]."""
+    return np.concatenate([values[0], values[-1], values[1:-1, 0], values[1:-1, -1]])

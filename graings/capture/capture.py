@@ -17,6 +17,7 @@ from graings.camera.camera import Camera, View
 from graings.camera.units import Units
 from graings.capture.lens import Lens
 
+Kind = Literal["transforms", "colmap", "nerfies", "llff"]
 Split = Literal["train", "val", "test", "between"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 # Beside the usual splits some captures hold images at times between those of training.
@@ -33,6 +34,8 @@ class Frame:
     image_path: Path
     source_size: tuple[int, int]  # width, height of the file in pixels
     lens: Lens | None = None  # how to undistort the file; None: it is a pinhole image already
+    orientation: int = 1  # the EXIF code by which the file's pixels are turned; 1: as stored
+    mask_path: Path | None = None  # an image that is black where pixels are to be ignored
 
     def view(self) -> View:
         """The frame without its image."""
@@ -52,7 +55,7 @@ class Capture:
     """Images with known cameras and times, in three splits (only `train` must hold frames)."""
 
     root: Path
-    kind: Literal["transforms", "colmap"]
+    kind: Kind
     train: tuple[Frame, ...]
     val: tuple[Frame, ...]
     test: tuple[Frame, ...]

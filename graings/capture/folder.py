@@ -10,6 +10,7 @@ import hashlib
 from pathlib import Path
 
 from graings.capture.image_file import SUFFIXES, ImageFile, check_image
+from graings.capture.names import FileNames
 from graings.errors import CaptureError
 
 
@@ -20,6 +21,8 @@ class CaptureFolder:
         self.root = root.resolve()
         self._digests: dict[str, str] = {}
         self._images: dict[str, ImageFile] = {}
+        self._names = FileNames(self.root)
+        self._respelled: dict[str, str] = {}
 
     def locate(self, name: str, *, source: str, field: str | None = None) -> Path:
         """The path of `name`, whether it exists or not; `source` and `field` are where the capture names it.
@@ -64,27 +67,55 @@ class CaptureFolder:
         self._digests[name] = hashlib.sha256(data).hexdigest()
         return data
 
-    def image(self, name: str, *, source: str, field: str | None = None) -> ImageFile:
-        """The image `name`, which may lack its extension; checked to be complete, not decoded.
+    def find(self, name: str, *, source: str, field: str | None = None) -> str | None:
+        """The file that `name` means, relative to `root` (`FileNames`); None without one.
 
-        Raises `CaptureError` where it is missing, truncated, too large or in an unsupported format.
+        Raises `CaptureError` where the name leads outside the capture or is ambiguous.
         """
-        candidates = [name, *(name + suffix for suffix in SUFFIXES)]
-        for candidate in candidates:
+        for candidate in self._names.candidates(name):
             path = self.locate(candidate, source=source, field=field)
             if path.is_file():
-                relative = path.relative_to(self.root).as_posix()
-                if ".." in Path(relative).parts:
-                    relative = path.resolve().relative_to(self.root).as_posix()
-                if relative not in self._images:
-                    self._images[relative] = check_image(path, relative, self.read(relative))
-                return self._images[relative]
-        raise CaptureError(
-            f"the image {name!r} is missing (tried without and with the extensions {', '.join(SUFFIXES)})",
-            file=source,
-            field=field,
-            remedy="Add the image or remove its entry.",
-        )
+                relative = path.relative_to(self.root)
+                return (path.resolve().relative_to(self.root) if ".." in relative.parts else relative).as_posix()
+        similar = self._names.similar(name, source=source, field=field)
+        if similar is not None:
+            self.locate(similar, source=source, field=field)  # it may be a link that leads outside
+            self._respelled[name] = similar
+        return similar
+
+    def find_image(self, name: str, *, source: str, field: str | None = None) -> ImageFile | None:
+        """The image `name`, which may lack its extension; checked to be complete, not decoded. None without one.
+
+        Raises `CaptureError` where it is truncated, too large or in an unsupported format.
+        """
+        relative = self.find(name, source=source, field=field)
+        if relative is None:
+            return None
+        if relative not in self._images:
+            self._images[relative] = check_image(self.root / relative, relative, self.read(relative))
+        return self._images[relative]
+
+    def image(self, name: str, *, source: str, field: str | None = None) -> ImageFile:
+        """As `find_image`. Raises `CaptureError` where there is none, too."""
+        image = self.find_image(name, source=source, field=field)
+        if image is None:
+            raise CaptureError(
+                f"the image {name!r} is missing (tried without and with the extensions {', '.join(SUFFIXES)})",
+                file=source,
+                field=field,
+                remedy="Add the image or remove its entry.",
+            )
+        return image
+
+    def notes(self) -> list[str]:
+        """What was assumed about the names of the files read so far."""
+        notes = []
+        if self._respelled:
+            name, found = next(iter(self._respelled.items()))
+            notes.append(
+                f"{len(self._respelled)} names are spelled differently on disk and were matched, {name} with {found}"
+            )
+        return notes
 
     def digest(self) -> str:
         """sha256 over names and contents of every file read so far."""

@@ -1,13 +1,13 @@
 """ImageFile: one image on disk, checked for completeness and size, and its pixels.
 
-PNG, JPEG and OpenEXR, recognised by content, not by name. Stored values are not converted: 8 bit as x/255, 16 bit as
-x/65535, EXR floats clipped to [0, 1] without a transfer curve.
+Formats are recognised by content, not by name. Stored values are not converted: 8 bit as x/255, 16 bit as x/65535,
+floats clipped to [0, 1] without a transfer curve.
 """
 
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +18,10 @@ from numpy.typing import NDArray
 from graings.constants import MAX_IMAGE_SIDE
 from graings.errors import CaptureError
 
-SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
+# Suffixes that a listed name may lack or have instead of another, in the order in which they are tried.
+SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".exr", ".jfif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".tga")
+# Pictures that are not read. They are looked for as well, so that the message can say why.
+UNREADABLE_SUFFIXES: Final = (".heic", ".heif", ".avif", ".dng", ".hdr")
 
 # A PNG of a few kilobytes can declare any size: larger images are refused before they are decoded.
 MAX_PIXELS: Final = 2**26  # 1 GB as RGBA float32
@@ -26,58 +29,80 @@ MAX_PIXELS: Final = 2**26  # 1 GB as RGBA float32
 PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE: Final = b"\xff\xd8\xff"
 EXR_SIGNATURE: Final = b"\x76\x2f\x31\x01"
+# These have no end marker that could be followed: they are decoded once.
+DECODED_ONCE: Final = (EXR_SIGNATURE, b"RIFF", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"GIF8")
+# The fourth to twelfth byte of containers for photographs whose decoders are not part of OpenImageIO's package.
+PHOTO_CONTAINERS: Final = {b"heic": "HEIC", b"heix": "HEIC", b"mif1": "HEIC", b"msf1": "HEIC", b"avif": "AVIF"}
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """A checked image; `name` is relative to the capture."""
+    """A checked image; `name` is relative to the capture.
+
+    `orientation` is the EXIF code: how a viewer turns the stored pixels. They are used as stored, as COLMAP does,
+    unless `upright`; width and height are those of the pixels as used.
+    """
 
     path: Path
     name: str
     width: int
     height: int
     has_alpha: bool
+    orientation: int = 1
+    upright: bool = False
+
+    def turned(self) -> ImageFile:
+        """The same image, turned as the EXIF code says."""
+        swaps = self.orientation >= 5
+        width, height = (self.height, self.width) if swaps else (self.width, self.height)
+        return replace(self, width=width, height=height, upright=True)
 
 
 def check_image(path: Path, name: str, data: bytes) -> ImageFile:
     """The header of the image at `path` whose contents are `data`, after a check that it is complete.
 
     PNG chunks and JPEG segments are followed to their end marker, because decoders fill a truncated JPEG with grey
-    without an error; EXR has no end marker and is decoded once. Raises `CaptureError` for truncated, damaged, too large
-    and unsupported images.
+    without an error; other formats have no end marker and are decoded once. Raises `CaptureError` for truncated,
+    damaged, too large and unsupported images.
     """
     if data.startswith(PNG_SIGNATURE):
         complete = _png_is_complete(data)
     elif data.startswith(JPEG_SIGNATURE):
         complete = _jpeg_is_complete(data)
-    elif data.startswith(EXR_SIGNATURE):
-        complete = True
-    elif not data:
-        complete = False
     else:
-        raise CaptureError("is no PNG, JPEG or OpenEXR image", file=name, remedy="Convert it to one of these.")
+        complete = bool(data)
+        if complete and not data.startswith(DECODED_ONCE) and path.suffix.lower() != ".tga":
+            kind = PHOTO_CONTAINERS.get(data[8:12]) if data[4:8] == b"ftyp" else None
+            raise CaptureError(
+                f"is a {kind} picture, which is not read" if kind else "is no image of a known format",
+                file=name,
+                remedy="Convert it to PNG or JPEG (PNG, JPEG, OpenEXR, WebP, TIFF, BMP, GIF and TGA are read).",
+            )
     if not complete:
         raise _damaged(name, "is truncated or damaged")
     source = _open(path, name)
     spec = source.spec()
     source.close()
-    image = ImageFile(path, name, spec.width, spec.height, _channels(spec, name)[1] is not None)
-    if data.startswith(EXR_SIGNATURE):
+    code = spec.get_int_attribute("Orientation", 1)
+    has_alpha = _channels(spec, name)[1] is not None
+    image = ImageFile(path, name, spec.width, spec.height, has_alpha, code if 1 <= code <= 8 else 1)
+    if not data.startswith((PNG_SIGNATURE, JPEG_SIGNATURE)):
         decode(path, name)
     return image
 
 
-def decode(path: Path, name: str) -> NDArray[np.float32]:
+def decode(path: Path, name: str, orientation: int = 1) -> NDArray[np.float32]:
     """Pixels [H, W, 3] or, where there is an alpha channel, [H, W, 4] premultiplied; float32 in [0, 1].
 
-    Raises `CaptureError` where the file cannot be decoded or holds a value that is not finite.
+    They are turned by the EXIF code `orientation`; 1: as stored. Raises `CaptureError` where the file cannot be decoded
+    or holds a value that is not finite.
     """
     source = _open(path, name)
     spec = source.spec()
     color, alpha = _channels(spec, name)
     stored = source.read_image(0, 0, 0, spec.nchannels, spec.format)
     problem = source.geterror()
-    premultiplied = source.format_name() == "openexr"  # as its standard requires; alpha of PNG is straight
+    straight = spec.get_int_attribute("oiio:UnassociatedAlpha") == 1  # PNG and WebP; EXR is premultiplied, TIFF either
     source.close()
     if stored is None or problem:
         raise _damaged(name, f"cannot be decoded ({' '.join(problem.split())})")
@@ -89,9 +114,20 @@ def decode(path: Path, name: str) -> NDArray[np.float32]:
         raise CaptureError("holds values that are not finite", file=name, remedy="Export the image again.")
     else:
         np.clip(pixels, 0.0, 1.0, out=pixels)
-    if alpha is not None and not premultiplied:
+    if alpha is not None and straight:
         pixels[..., :3] *= pixels[..., 3:]
-    return pixels
+    return pixels if orientation == 1 else _turned(pixels, orientation)
+
+
+def _turned(pixels: NDArray[np.float32], orientation: int) -> NDArray[np.float32]:
+    """`pixels` as a viewer shows them: EXIF codes 5 to 8 exchange rows and columns, and each code mirrors some axes."""
+    if orientation >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if orientation in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return np.ascontiguousarray(pixels)
 
 
 def _open(path: Path, name: str) -> oiio.ImageInput:
@@ -124,7 +160,8 @@ def _open(path: Path, name: str) -> oiio.ImageInput:
 def _channels(spec: oiio.ImageSpec, name: str) -> tuple[list[int], int | None]:
     """Indices of the three colour channels (grey three times) and of alpha, or None."""
     names = list(spec.channelnames)
-    alpha = spec.alpha_channel if spec.alpha_channel >= 0 else None
+    last = names.index("A") if "A" in names else spec.alpha_channel  # the index is wrong for GIF
+    alpha = last if 0 <= last < len(names) else None
     if {"R", "G", "B"} <= set(names):
         return [names.index(c) for c in "RGB"], alpha
     if len(names) - (alpha is not None) == 1:

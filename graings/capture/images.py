@@ -1,8 +1,8 @@
 """ImageStore: pixels of frames, decoded on demand and held in a bounded cache.
 
-Decode, undistort, shrink by exact area average on premultiplied alpha, composite on the background. The cache holds
-16-bit integers, half the memory of float32; rounding changes a value by at most 0.002 levels of 255, and opaque pixels
-of 8 or 16 bits at their original size not at all.
+Decode, undistort, shrink by exact area average on premultiplied alpha, composite on the background; masks likewise
+(`graings.capture.mask`). The cache holds 16-bit integers, half the memory of float32; rounding changes a value by at
+most 0.002 levels of 255, and opaque pixels of 8 or 16 bits at their original size not at all.
 """
 
 from __future__ import annotations
@@ -11,22 +11,34 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graings.capture.capture import Frame
 from graings.capture.image_file import decode
+from graings.capture.mask import ALL, Mask, read_mask, undistorted
 from graings.errors import CaptureError
 
 Image = NDArray[np.float32]
 Quantized = NDArray[np.uint16]
 ImageKey = tuple[Path, int, int]  # file, width and height after shrinking
-PartKey = tuple[Path, int, int, str]  # as above, and "rgb" or "alpha"
+Part = Literal["rgb", "alpha", "valid"]
+PartKey = tuple[Path, int, int, Part]
 
 LEVELS: Final = np.float32(65535)  # the quantized value of 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pixels:
+    """One decoded image [H, W, 3]; alpha and valid pixels [H, W] are None where they are 1 everywhere."""
+
+    rgb: Quantized
+    alpha: Quantized | None
+    valid: Mask | None
 
 
 class ImageStore:
@@ -38,10 +50,10 @@ class ImageStore:
         self._background_is_rounded = bool((_dequantize(self._quantized_background) != self._background).any())
         self._limit = cache_mb * 1_000_000
         self._lock = threading.Lock()
-        self._cache: OrderedDict[PartKey, Quantized | None] = OrderedDict()
+        self._cache: OrderedDict[PartKey, Quantized | Mask | None] = OrderedDict()
         self._bytes = 0
         self._prefetcher = ThreadPoolExecutor(1, "decoder")
-        self._pending: dict[ImageKey, Future[tuple[Quantized, Quantized | None]]] = {}
+        self._pending: dict[ImageKey, Future[_Pixels]] = {}
 
     def prefetch(self, frame: Frame) -> None:
         """Start decoding `frame` on another thread; an error is raised by the next `rgb` or `alpha` of the frame."""
@@ -70,12 +82,19 @@ class ImageStore:
         quantized = self._get(frame, "alpha")
         return None if quantized is None else _dequantize(quantized)
 
+    def valid(self, frame: Frame) -> Mask | None:
+        """Pixels [H, W] that take part in losses and metrics; None where all do.
+
+        A pixel averaged from several of the file is valid where all of them are.
+        """
+        return None if frame.mask_path is None else self._get(frame, "valid")
+
     @property
     def cached_bytes(self) -> int:
         """Memory of the cached arrays in bytes."""
         return self._bytes
 
-    def _get(self, frame: Frame, part: str) -> Quantized | None:
+    def _get(self, frame: Frame, part: Part) -> NDArray[Any] | None:
         key = _image_key(frame)
         part_key = (*key, part)
         with self._lock:
@@ -84,13 +103,14 @@ class ImageStore:
                 self._cache.move_to_end(part_key)
                 return self._cache[part_key]
         # Outside the lock, so that threads decode in parallel; rarely two threads decode the same frame.
-        rgb, alpha = self._load(frame) if pending is None else pending.result()
+        pixels = self._load(frame) if pending is None else pending.result()
         with self._lock:
-            self._add_to_cache((*key, "alpha"), alpha)
-            self._add_to_cache((*key, "rgb"), rgb)
-        return rgb if part == "rgb" else alpha
+            self._add_to_cache((*key, "valid"), pixels.valid)
+            self._add_to_cache((*key, "alpha"), pixels.alpha)
+            self._add_to_cache((*key, "rgb"), pixels.rgb)
+        return {"rgb": pixels.rgb, "alpha": pixels.alpha, "valid": pixels.valid}[part]
 
-    def _add_to_cache(self, key: PartKey, image: Quantized | None) -> None:
+    def _add_to_cache(self, key: PartKey, image: NDArray[Any] | None) -> None:
         if key in self._cache:
             return
         self._cache[key] = image
@@ -99,8 +119,8 @@ class ImageStore:
             _, dropped = self._cache.popitem(last=False)
             self._bytes -= 0 if dropped is None else dropped.nbytes
 
-    def _load(self, frame: Frame) -> tuple[Quantized, Quantized | None]:
-        pixels = decode(frame.image_path, frame.name)
+    def _load(self, frame: Frame) -> _Pixels:
+        pixels = decode(frame.image_path, frame.name, frame.orientation)
         if (pixels.shape[1], pixels.shape[0]) != frame.source_size:
             raise CaptureError(
                 f"is {pixels.shape[1]}x{pixels.shape[0]} px, was {frame.source_size[0]}x{frame.source_size[1]} before",
@@ -111,13 +131,22 @@ class ImageStore:
         if frame.lens is not None:
             pixels = frame.lens.undistort(pixels)
         pixels = shrink(pixels, frame.camera.width, frame.camera.height)
+        valid = _valid(frame)
         if pixels.shape[2] == 3:
-            return _quantize(pixels), None
+            return _Pixels(_quantize(pixels), None, valid)
         alpha = pixels[..., 3]
         rgb = pixels[..., :3] + self._background * (1.0 - alpha)[..., None]
         quantized_alpha = _quantize(alpha)
         opaque = (quantized_alpha == LEVELS).all()
-        return _quantize(np.minimum(rgb, np.float32(1.0))), None if opaque else quantized_alpha
+        return _Pixels(_quantize(np.minimum(rgb, np.float32(1.0))), None if opaque else quantized_alpha, valid)
+
+
+def _valid(frame: Frame) -> Mask | None:
+    if frame.mask_path is None:
+        return None
+    share = undistorted(read_mask(frame.mask_path, frame.mask_path.name, frame.source_size), frame.lens)
+    valid = np.asarray(shrink(share, frame.camera.width, frame.camera.height)[..., 0] >= ALL)
+    return None if valid.all() else valid
 
 
 def _quantize(image: Image) -> Quantized:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
 from graings.camera.units import Units
-from graings.capture.capture import ALL_SPLITS, Capture, Frame, PointCloud
+from graings.capture.capture import ALL_SPLITS, Capture, Frame, Kind, PointCloud
 from graings.capture.raw_capture import MAX_MAGNITUDE, RawCapture, RawFrame
 from graings.errors import CaptureError
 
@@ -23,6 +23,14 @@ Array = NDArray[np.float64]
 
 # Focal lengths and principal points outside these bounds, in image sizes, are errors of the file.
 MIN_FOCAL_LENGTH, MAX_FOCAL_LENGTH, MAX_PRINCIPAL_POINT = 1e-3, 1e6, 1e3
+
+# Where each kind of capture gives its times, for a message.
+TIMES: dict[Kind, str] = {
+    "transforms": "the key `time` of each frame",
+    "colmap": 'times.json beside images/, {"NAME": time}',
+    "nerfies": "the key `time_id` of each entry of metadata.json",
+    "llff": "a folder of frames for each camera",
+}
 
 # Times that differ by no more than this fraction of the whole range are one instant.
 TIME_TOLERANCE = 1e-6
@@ -64,7 +72,10 @@ def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash
     instants = _merged_times([raw_frame.time for raw_frame in raw_frames if raw_frame.time is not None])
     times = sorted(set(instants.values()))
     if not times:
-        notes.append("no times: the scene is assumed to be static")
+        notes.append(
+            "no times: the scene is assumed to be static; if it moves, give every image its time "
+            f"({TIMES[raw.kind]}), or set capture.times_from_names=true to take it from the number in its file name"
+        )
     elif len(times) == 1:
         notes.append("all frames share one time: the scene is assumed to be static")
     units = Units(
@@ -93,6 +104,8 @@ def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash
             image_path=raw_frame.image.path,
             source_size=(raw_frame.image.width, raw_frame.image.height),
             lens=raw_frame.lens,
+            orientation=raw_frame.image.orientation if raw_frame.image.upright else 1,
+            mask_path=None if raw_frame.mask is None else raw_frame.mask.path,
         )
 
     splits = {split: tuple(normalized(raw_frame) for raw_frame in raw.splits.get(split, ())) for split in ALL_SPLITS}

@@ -5,14 +5,14 @@ Plain data between the readers and `graings.capture.normalize`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
-from graings.capture.capture import Split
+from graings.capture.capture import Kind, Split
 from graings.capture.image_file import ImageFile
 from graings.capture.lens import Lens
 
@@ -28,21 +28,26 @@ class RawFrame:
     camera: Camera
     time: float | None  # None: the capture gives no times
     lens: Lens | None = None
+    mask: ImageFile | None = None  # black where pixels are to be ignored
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawCapture:
     """All frames of a capture; points `positions` [M, 3] in the capture's unit with `colors` [M, 3] in [0, 1]."""
 
-    kind: Literal["transforms", "colmap"]
+    kind: Kind
     splits: dict[Split, tuple[RawFrame, ...]]
     notes: tuple[str, ...] = ()
     positions: NDArray[np.float64] | None = None
     colors: NDArray[np.float32] | None = None
 
+    def noted(self, *notes: str) -> RawCapture:
+        """The same with further `notes`."""
+        return replace(self, notes=(*self.notes, *notes))
+
     @staticmethod
     def with_points(
-        kind: Literal["transforms", "colmap"],
+        kind: Kind,
         splits: dict[Split, tuple[RawFrame, ...]],
         notes: list[str],
         positions: NDArray[np.float64],

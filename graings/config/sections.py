@@ -40,6 +40,17 @@ class CaptureConfig(ConfigSection):
     times_from_names: bool = Field(
         False, description="Read the time of a frame from the number in its file name if the capture has no times."
     )
+    rig: bool = Field(
+        False,
+        description="Calibrated still cameras with a folder of frames each: every frame of the folder NAME has the "
+        "camera of the calibrated image NAME, and the number in its file name is its time.",
+    )
+    orientation: Literal["auto", "stored", "upright"] = Field(
+        "auto",
+        description="Pictures with an EXIF orientation. stored: pixels as they are in the file, as COLMAP reads them; "
+        "upright: turned as viewers show them; auto: as stored, unless the size in px of the camera fits only the "
+        "turned picture.",
+    )
     test_every: int = Field(
         8,
         ge=2,

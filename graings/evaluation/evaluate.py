@@ -5,11 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 
-from numpy.typing import ArrayLike
-
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
-from graings.evaluation.metrics import SplitMetrics, measure_split
+from graings.evaluation.metrics import Pair, SplitMetrics, measure_split
 from graings.evaluation.perceptual import PerceptualDistances
 from graings.render import render
 from graings.scene.prepared import PreparedScene
@@ -27,10 +25,11 @@ def evaluate(
     """Metrics of `scene` on `frames`: each view rendered at its own camera and time."""
     prepared = PreparedScene(scene)
 
-    def pairs() -> Iterator[tuple[str, float, ArrayLike, ArrayLike]]:
+    def pairs() -> Iterator[Pair]:
         for frame in frames:
             rendered = render(prepared, frame.camera, frame.time, background)
-            yield frame.name, frame.time, rendered.color.clamp(0, 1).numpy(), images.rgb(frame)
+            color = rendered.color.clamp(0, 1).numpy()
+            yield Pair(frame.name, frame.time, color, images.rgb(frame), images.valid(frame))
 
     return measure_split(pairs(), distances)
 

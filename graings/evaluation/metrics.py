@@ -3,25 +3,42 @@
 Every number is taken per image, on values rounded to 8 bits as a saved PNG would hold them, and then averaged
 over images. Names carry the definition, because definitions differ: the SSIM of other packages is up to 0.02
 away from `ssim_3dgs` for the same two images. Images are [H, W, 3] in [0, 1].
+
+Where an image has a mask, its numbers are those of the valid pixels, as the mPSNR, mSSIM and mLPIPS of Gao et al.
+("Monocular Dynamic View Synthesis", 2022): no value of a masked pixel changes them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from graings.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from graings.document import Document
 from graings.evaluation.perceptual import LPIPS_MIN_SIDE, Image, PerceptualDistances
 
+Mask = NDArray[np.bool_]
+
 # Below this mean squared error PSNR is 100 dB: the logarithm of 0, the error of two equal images, is not finite.
 MSE_FLOOR: Final = 1e-10
 PSNR_CAP: Final = 100.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """A rendered image, its photograph [H, W, 3], and the `valid` pixels [H, W] that are compared (None: all)."""
+
+    name: str
+    time: float
+    image: ArrayLike
+    target: ArrayLike
+    valid: Mask | None = None
 
 
 class ViewMetrics(Document):
@@ -34,6 +51,9 @@ class ViewMetrics(Document):
     lpips_vgg: float | None = Field(description="LPIPS distance with VGG weights; null where it was not measured.")
     flip_ldr: float | None = Field(description="Mean LDR-FLIP error in [0, 1]; null where it was not measured.")
     mse: float = Field(ge=0, description="Mean squared error over pixels and channels in [0, 1].")
+    compared: float = Field(
+        1.0, gt=0, le=1, description="Share of the pixels that the numbers are about; below 1 where some are masked."
+    )
 
 
 class SplitMeans(Document):
@@ -90,28 +110,29 @@ class SplitMetrics(SplitMeans):
         )
 
 
-def measure_split(
-    pairs: Iterable[tuple[str, float, ArrayLike, ArrayLike]], distances: PerceptualDistances | None = None
-) -> SplitMetrics:
-    """Metrics of a split from its (name, time, image, photograph), one pair in memory at a time."""
-    views = tuple(measure(name, time, image, target, distances) for name, time, image, target in pairs)
+def measure_split(pairs: Iterable[Pair], distances: PerceptualDistances | None = None) -> SplitMetrics:
+    """Metrics of a split, one pair in memory at a time. Images that are masked everywhere are left out."""
+    views = [measure(pair, distances) for pair in pairs if pair.valid is None or pair.valid.any()]
     return SplitMetrics.over(views, distances)
 
 
-def measure(
-    name: str, time: float, image: ArrayLike, target: ArrayLike, distances: PerceptualDistances | None = None
-) -> ViewMetrics:
-    """All metrics of one image."""
-    image_, target_ = _rounded_pair(image, target)
-    error = _mse(image_, target_)
+def measure(pair: Pair, distances: PerceptualDistances | None = None) -> ViewMetrics:
+    """All metrics of one image, which has at least one valid pixel."""
+    image, target = _rounded_pair(pair.image, pair.target)
+    valid = np.ones(image.shape[:2], np.bool_) if pair.valid is None else pair.valid
+    share, error = float(valid.mean()), _mse(image[valid], target[valid])
+    # The perceptual distances are means over the image: to them masked pixels are grey in both and differ by nothing.
+    shown = [np.where(valid[..., None], each, 0.5) for each in (image, target)]
+    lpips, flip = (None, None) if distances is None else (distances.lpips(*shown), distances.flip(*shown))
     return ViewMetrics(
-        name=name,
-        time=float(time),
+        name=pair.name,
+        time=float(pair.time),
         psnr=_psnr_of(error),
-        ssim_3dgs=_ssim(image_, target_),
-        lpips_vgg=None if distances is None else distances.lpips(image_, target_),
-        flip_ldr=None if distances is None else distances.flip(image_, target_),
+        ssim_3dgs=_ssim(image, target, pair.valid),
+        lpips_vgg=None if lpips is None else lpips / share,
+        flip_ldr=None if flip is None else flip / share,
         mse=error,
+        compared=share,
     )
 
 
@@ -126,13 +147,14 @@ def psnr(image: ArrayLike, target: ArrayLike) -> float:
     return _psnr_of(_mse(*_rounded_pair(image, target)))
 
 
-def ssim_3dgs(image: ArrayLike, target: ArrayLike) -> float:
+def ssim_3dgs(image: ArrayLike, target: ArrayLike, valid: Mask | None = None) -> float:
     """Structural similarity in [-1, 1] as 3D Gaussian Splatting computes it.
 
     Gaussian window of 11 x 11 with sigma 1.5, borders padded with zeros, mean over pixels and channels; in
-    float64, with variances kept from falling below zero by rounding (Wang et al. 2004, Eq. 13).
+    float64, with variances kept from falling below zero by rounding (Wang et al. 2004, Eq. 13). With `valid` [H, W]
+    windows average over its pixels only, and the mean is over them.
     """
-    return _ssim(*_rounded_pair(image, target))
+    return _ssim(*_rounded_pair(image, target), valid)
 
 
 def _rounded_pair(image: ArrayLike, target: ArrayLike) -> tuple[Image, Image]:
@@ -158,19 +180,27 @@ def _psnr_of(mse: float) -> float:
     return PSNR_CAP if mse <= MSE_FLOOR else -10.0 * math.log10(mse)
 
 
-def _ssim(image: Image, target: Image) -> float:
+def _ssim(image: Image, target: Image, valid: Mask | None) -> float:
     # One channel at a time: five maps of a 12-megapixel photograph are half a gigabyte.
-    return math.fsum(_ssim_channel(image[..., c], target[..., c]) for c in range(3)) / 3.0
+    return math.fsum(_ssim_channel(image[..., c], target[..., c], valid) for c in range(3)) / 3.0
 
 
-def _ssim_channel(x: Image, y: Image) -> float:
-    mean_x, mean_y = _blur(x), _blur(y)
-    var_x = np.maximum(_blur(x * x) - mean_x**2, 0.0)
-    var_y = np.maximum(_blur(y * y) - mean_y**2, 0.0)
-    covariance = _blur(x * y) - mean_x * mean_y
+def _ssim_channel(x: Image, y: Image, valid: Mask | None) -> float:
+    def mean(values: Image) -> Image:
+        return _blur(values) if valid is None else _blur(values * valid) * weight
+
+    if valid is not None:
+        # Windows keep the weight that they have without the mask: below 1 only at the border of the image.
+        share = _blur(valid.astype(np.float64))
+        weight = _blur(np.ones_like(x)) / np.where(valid, share, 1.0)
+    mean_x, mean_y = mean(x), mean(y)
+    var_x = np.maximum(mean(x * x) - mean_x**2, 0.0)
+    var_y = np.maximum(mean(y * y) - mean_y**2, 0.0)
+    covariance = mean(x * y) - mean_x * mean_y
     luminance = (2.0 * mean_x * mean_y + SSIM_C1) / (mean_x**2 + mean_y**2 + SSIM_C1)
     structure = (2.0 * covariance + SSIM_C2) / (var_x + var_y + SSIM_C2)
-    return float(np.mean(np.clip(luminance * structure, -1.0, 1.0)))
+    similarity = np.clip(luminance * structure, -1.0, 1.0)
+    return float(np.mean(similarity if valid is None else similarity[valid]))
 
 
 def _blur(values: Image) -> Image:

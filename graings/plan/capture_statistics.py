@@ -99,14 +99,14 @@ def measure(capture: Capture, images: ImageStore, background: Sequence[float]) -
     small: dict[str, Image] = {}
     coverage, detail, opaque = [], [], True
     for frame in sample:
-        image = images.rgb(frame)
+        image = _without_masked(images, frame, background)
         opaque = opaque and images.alpha(frame) is None
         if frame.name in typical:
             coverage.append(_coverage(image, background))
             detail.append(_detail(image))
         small[frame.name] = _reduced(image)
     examined = [[frame for frame in frames if frame.name in small] for frames in fixed]
-    noise, gain, offset, change = _over_time(examined, small, images)
+    noise, gain, offset, change = _over_time(examined, small, images, background)
     testable = len(fixed) == len(groups) and all(len(frames) > 1 for frames in examined)
     camera = capture.train[0].camera
     if noise is None:
@@ -172,7 +172,7 @@ def _sample(groups: Sequence[Sequence[Frame]], most: int) -> list[Frame]:
 
 
 def _over_time(
-    cameras: Sequence[Sequence[Frame]], small: dict[str, Image], images: ImageStore
+    cameras: Sequence[Sequence[Frame]], small: dict[str, Image], images: ImageStore, background: Sequence[float]
 ) -> tuple[float | None, tuple[float, float] | None, float | None, TileChange | None]:
     """Noise, range of gains, greatest offset and largest change of the fixed cameras; None without any."""
     noises: list[float] = []
@@ -192,7 +192,7 @@ def _over_time(
         compare(frames, np.stack([small[frame.name] for frame in frames]))
         if max(frames[0].camera.width, frames[0].camera.height) > MAX_SIDE:
             few = list({frame.name: frame for frame in (frames[0], frames[len(frames) // 2], frames[-1])}.values())
-            compare(few, np.stack([images.rgb(frame) for frame in few]))
+            compare(few, np.stack([_without_masked(images, frame, background) for frame in few]))
     if not found:
         return None, None, None, None
     every = np.concatenate(fits)
@@ -203,6 +203,12 @@ def _over_time(
 def _named(change: Change, frames: Sequence[Frame], px: int) -> TileChange:
     image = frames[change.pair[0] if change.pair[1] == -1 else change.pair[1]].name
     return TileChange(ratio=change.ratio, value=change.value, image=image, tile=change.tile, px=px)
+
+
+def _without_masked(images: ImageStore, frame: Frame, background: Sequence[float]) -> Image:
+    """The image [H, W, 3] with masked pixels in the colour of the background, which shows nothing."""
+    image, valid = images.rgb(frame), images.valid(frame)
+    return image if valid is None else np.where(valid[..., None], image, np.asarray(background, dtype=np.float32))
 
 
 def _reduced(image: Image) -> Image:

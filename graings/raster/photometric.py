@@ -10,11 +10,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from graings import kernel
+from graings.raster.masking import without_masked
 
 
 def ssim(
@@ -34,12 +35,17 @@ def photometric(
     ssim_weight: float,
     squared_weight: float = 0.0,
     *,
+    valid: Bool[Tensor, "height width"] | None = None,
     threads: int | None = None,
 ) -> Float[Tensor, ""]:
     """(1 - w) |image - target|_1 + w (1 - SSIM) + q (image - target)^2, means over pixels and channels.
 
-    w is `ssim_weight`, q `squared_weight`; without q it is Eq. 15. Arguments and errors are those of `ssim`.
+    w is `ssim_weight`, q `squared_weight`; without q it is Eq. 15. With `valid` the means are over its pixels, and the
+    others change neither value nor gradient (`graings.raster.masking`). Other arguments and errors are those of `ssim`.
     """
+    if valid is not None:
+        image, target, share = without_masked(image, target, valid)
+        return photometric(image, target, ssim_weight, squared_weight, threads=threads) / share
     return ssim_weight + _weighted_sum(image, target, -ssim_weight, 1.0 - ssim_weight, squared_weight, threads)
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
 from graings.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
+from graings.raster.masking import without_masked
 
 
 def ssim(
@@ -38,9 +39,13 @@ def photometric(
     ssim_weight: float,
     squared_weight: float = 0.0,
     *,
+    valid: Bool[Tensor, "height width"] | None = None,
     threads: int | None = None,
 ) -> Float[Tensor, ""]:
     """(1 - w) |image - target|_1 + w (1 - SSIM) + q (image - target)^2; `threads` is ignored."""
+    if valid is not None:
+        image, target, share = without_masked(image, target, valid)
+        return photometric(image, target, ssim_weight, squared_weight) / share
     difference = image.double() - target.double()
     absolute, squared = (mean.to(image.dtype) for mean in (difference.abs().mean(), difference.square().mean()))
     return (1.0 - ssim_weight) * absolute + ssim_weight * (1.0 - ssim(image, target)) + squared_weight * squared

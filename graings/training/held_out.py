@@ -8,11 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-from numpy.typing import ArrayLike
 
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
-from graings.evaluation.metrics import SplitMetrics, measure_split
+from graings.evaluation.metrics import Pair, SplitMetrics, measure_split
 from graings.evaluation.perceptual import PerceptualDistances
 from graings.render import render_composition
 from graings.scene.prepared import PreparedScene
@@ -44,7 +43,7 @@ class HeldOut:
         footprints, seconds = SubpixelCounter(scene), list[float]()
         prepared = PreparedScene(scene, kept_times=0)  # every view counts as one of a new time
 
-        def pairs() -> Iterator[tuple[str, float, ArrayLike, ArrayLike]]:
+        def pairs() -> Iterator[Pair]:
             for frame in frames:
                 started = time.perf_counter()
                 with torch.inference_mode():
@@ -52,7 +51,8 @@ class HeldOut:
                     result = render_composition(composition, frame.camera, background)
                 seconds.append(time.perf_counter() - started)
                 footprints.add(composition, result.radii, frame.camera)
-                yield frame.name, frame.time, result.color.clamp(0, 1).numpy(), images.rgb(frame)
+                color = result.color.clamp(0, 1).numpy()
+                yield Pair(frame.name, frame.time, color, images.rgb(frame), images.valid(frame))
 
         metrics = measure_split(pairs(), distances)
         fps = 1.0 / max(statistics.median(seconds[1:] or seconds), 1e-9)

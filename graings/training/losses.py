@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
@@ -42,15 +42,22 @@ def residual(change: Float[Tensor, "gaussian 4"]) -> Tensor:
     return mean_square(change)
 
 
-def alpha(drawn: Float[Tensor, "height width"], seen: Float[Tensor, "height width"]) -> Tensor:
-    """Mean over pixels of the absolute difference between rendered alpha and image alpha, both in [0, 1].
+def alpha(
+    drawn: Float[Tensor, "height width"],
+    seen: Float[Tensor, "height width"],
+    valid: Bool[Tensor, "height width"] | None = None,
+) -> Tensor:
+    """Mean over pixels, or the `valid` ones, of the absolute difference of rendered and image alpha in [0, 1].
 
     Below a `LEVEL` it is quadratic (Girshick's smooth L1, "Fast R-CNN", Eq. 3).
 
     Not in the paper: on one background, a hole and an object of the background colour look the same, and so do empty
     space and semi-transparent Gaussians of that colour.
     """
-    return functional.smooth_l1_loss(drawn, seen, beta=LEVEL)
+    if valid is None:
+        return functional.smooth_l1_loss(drawn, seen, beta=LEVEL)
+    total = functional.smooth_l1_loss(drawn[valid], seen[valid], beta=LEVEL, reduction="sum")
+    return total / valid.sum().clamp_min(1)
 
 
 def rigidity(lengths: Float[Tensor, "instant pair"], weights: Float[Tensor, " pair"]) -> Tensor:

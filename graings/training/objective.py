@@ -55,17 +55,18 @@ class Objective:
     ) -> StepLoss:
         """The loss of the views `frames`, composed together and drawn as `results`."""
         targets = [torch.from_numpy(self.images.rgb(frame)) for frame in frames]
+        masks = [self._valid(frame) for frame in frames]
         squared = self._squared_weight(iteration)
         differences = torch.stack(
             [
-                photometric(result.color, target, self.config.loss.ssim, squared)
-                for result, target in zip(results, targets, strict=True)
+                photometric(result.color, target, self.config.loss.ssim, squared, valid=valid)
+                for result, target, valid in zip(results, targets, masks, strict=True)
             ]
         )
         moments = [frame.time for frame in frames]
         total = self.regularisers(scene, compositions, moments) + differences.mean()
         total = total + self._alpha_term(frames, results)
-        mse = tuple(float(functional.mse_loss(r.color.detach(), t)) for r, t in zip(results, targets, strict=True))
+        mse = tuple(_mse(r.color.detach(), t, v) for r, t, v in zip(results, targets, masks, strict=True))
         without_squared = total.detach() - squared * statistics.mean(mse)
         return StepLoss(total, without_squared, differences, mse)
 
@@ -86,5 +87,17 @@ class Objective:
         for frame, result in zip(frames, results, strict=True):
             alpha = self.images.alpha(frame)
             if alpha is not None:
-                total = total + losses.alpha(result.alpha, torch.from_numpy(alpha))
+                total = total + losses.alpha(result.alpha, torch.from_numpy(alpha), self._valid(frame))
         return total * (weight / len(frames))
+
+    def _valid(self, frame: Frame) -> Tensor | None:
+        """The pixels [H, W] of `frame` that are not masked; None without a mask."""
+        valid = self.images.valid(frame)
+        return None if valid is None else torch.from_numpy(valid)
+
+
+def _mse(image: Tensor, target: Tensor, valid: Tensor | None) -> float:
+    """Mean squared difference over the `valid` pixels; 0 where there are none."""
+    if valid is None:
+        return float(functional.mse_loss(image, target))
+    return float(functional.mse_loss(image[valid], target[valid], reduction="sum") / (3 * valid.sum()).clamp_min(1))

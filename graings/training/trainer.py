@@ -91,7 +91,8 @@ class Trainer(TrainerState):
             events += self._limit_gradients(check, frames)
             # A step far above the usual size gives no evidence of where anchors are needed.
             if self.watches() and not check.limits:
-                self.density.observe(frames, compositions, results, offsets)
+                masks = [self.images.valid(frame) for frame in frames]
+                self.density.observe(frames, compositions, results, offsets, masks)
             self.optimizer.step(self.iteration)
             self._measure_step(compositions[0], frames[0])
         else:

@@ -32,15 +32,20 @@ def view_dependence(
         return None
     losses = []
     for index, frame in enumerate(frames):
-        target = torch.from_numpy(images.rgb(frame))
+        target, valid = torch.from_numpy(images.rgb(frame)), images.valid(frame)
+        kept = torch.ones(target.shape[:2], dtype=torch.bool) if valid is None else torch.from_numpy(valid)
+        if not kept.any():
+            continue
         third = len(others) // (OTHER_VIEWS + 1)
         eyes = [others[(index + turn * third) % len(others)].camera.center for turn in range(1, OTHER_VIEWS + 1)]
         own, *rest = (
-            _psnr(render_composition(scene.compose(eye, frame.time), frame.camera, background).color, target)
+            _psnr(
+                render_composition(scene.compose(eye, frame.time), frame.camera, background).color[kept], target[kept]
+            )
             for eye in (frame.camera.center, *eyes)
         )
         losses.append(own - statistics.mean(rest))
-    return statistics.mean(losses)
+    return statistics.mean(losses) if losses else None
 
 
 def _psnr(image: torch.Tensor, target: torch.Tensor) -> float:

@@ -82,6 +82,7 @@ def write_dnerf(folder: Path, times: list[float] | None = None, *, radius: float
         for i in range(count)
     ]
     write_transforms(folder, "train", frames)
+    write_transforms(folder, "val", [])  # otherwise images would be held out
     return folder
 
 

@@ -30,7 +30,7 @@ CAMERAS, IMAGES, POINTS = (f"sparse/0/{name}.bin" for name in ("cameras", "image
 # cameras.bin: count, then id, model, width, height, fx, fy, cx, cy. images.bin: count, then id, quaternion, ...
 BROKEN_COLMAP: dict[str, tuple[Break, str]] = {
     "missing image": (
-        lambda f: (f / "images/frame_0030.png").unlink(),
+        lambda f: [(f / f"images/frame_00{n}0.png").unlink() for n in (3, 4, 5)],
         r"sparse/0, image 'frame_0030\.png': .*is missing",
     ),
     "missing images.bin": (lambda f: (f / IMAGES).unlink(), rf"{IMAGES}: is missing"),

@@ -149,6 +149,7 @@ def test_chain_of_close_times_does_not_collapse(tmp_path: Path) -> None:
         write_image(tmp_path / f"train/{index}.png", pixels(12, 12, seed=index))
     times = [0.0, 0.8e-6, 1.6e-6, 2.4e-6, 3.2e-6, 1.0]
     write_transforms(tmp_path, "train", [entry(orbit(i, 6), f"train/{i}", times[i]) for i in range(6)])
+    write_transforms(tmp_path, "val", [])
     assert load_capture(tmp_path).times.tolist() == [0.0, 1.6e-6, 3.2e-6, 1.0]
 
 

@@ -138,11 +138,6 @@ def test_points_are_those_of_the_ply_file(tmp_path: Path) -> None:
     assert "1 of 3 points are discarded: not finite or beyond 1e+15" in capture.notes
 
 
-def test_a_note_says_that_masks_are_not_used(tmp_path: Path) -> None:
-    notes = load_capture(write_single(tmp_path, 4, frame={"mask_path": "masks/0.png"})).notes
-    assert any(note.startswith("masks are not used (4 frames") for note in notes)
-
-
 def test_files_per_split_and_colmap_models_take_precedence(tmp_path: Path) -> None:
     write_single(tmp_path, 4)
     (tmp_path / "transforms.json").write_text("not even JSON")
@@ -173,7 +168,7 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     ),
     "an unknown name in a split": (
         top(val_filenames=["images/frame_00003.png", "images/other.png"]),
-        r"transforms\.json, val_filenames\[1\]: the image 'images/other\.png' is missing",
+        r"transforms\.json, val_filenames\[1\]: 'images/other\.png' is no image of frames",
     ),
     "an image that is no frame's in a split": (
         top(val_filenames=["spare.png"]),
@@ -187,7 +182,7 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "points outside": (top(ply_file_path="../gone.ply"), r"transforms\.json, ply_file_path: .*leads outside"),
     "time for some only": (
         lambda document: document["frames"][1].update(time=0.5),
-        r"transforms\.json, frames\[0\]\.time: the time is missing here",
+        r"transforms\.json, time of images/frame_00003\.png: the time is missing here",
     ),
 }
 

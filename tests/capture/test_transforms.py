@@ -33,6 +33,7 @@ def test_file_path_may_lack_extension_and_dot(tmp_path: Path, style: str) -> Non
     write_dnerf(tmp_path, TIMES)
     frames = [entry(orbit(i, 4), style.format(i), TIMES[i]) for i in range(4)]
     write_transforms(tmp_path, "train", frames)
+    write_transforms(tmp_path, "val", [])
     capture = load_capture(tmp_path)
     assert [frame.name for frame in capture.train] == [f"train/r_{i:03d}.png" for i in range(4)]
     assert [frame.time for frame in capture.train] == TIMES

@@ -13,7 +13,8 @@ from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
 from graings.config import CaptureConfig
 from graings.evaluation.evaluate import evaluate
-from graings.evaluation.metrics import SplitMetrics, measure, measure_split, psnr, ssim_3dgs
+from graings.evaluation.metrics import Pair, SplitMetrics, measure, measure_split, psnr, ssim_3dgs
+from graings.evaluation.perceptual import Flip, Lpips, PerceptualDistances
 from tests.models import tiny_scene
 
 
@@ -79,7 +80,7 @@ def test_ssim_of_flat_images_stays_at_one_in_spite_of_cancelling_variances() -> 
 
 def test_tensors_and_arrays_measure_the_same() -> None:
     x, y = noise(3, 20, 20).astype(np.float32), noise(4, 20, 20).astype(np.float32)
-    assert measure("v", 0.5, torch.from_numpy(x), torch.from_numpy(y)) == measure("v", 0.5, x, y)
+    assert measure(Pair("v", 0.5, torch.from_numpy(x), torch.from_numpy(y))) == measure(Pair("v", 0.5, x, y))
 
 
 @pytest.mark.parametrize(
@@ -94,12 +95,12 @@ def test_tensors_and_arrays_measure_the_same() -> None:
 )
 def test_what_is_no_pair_of_images_is_refused(image: np.ndarray, target: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        measure("v", 0.0, image, target)
+        measure(Pair("v", 0.0, image, target))
 
 
 def test_a_split_averages_decibels_and_not_errors() -> None:
     target = np.full((4, 4, 3), 100.0 / 255.0)
-    pairs = [(f"v{k}", 0.0, target + k / 255.0, target) for k in (1, 10)]
+    pairs = [Pair(f"v{k}", 0.0, target + k / 255.0, target) for k in (1, 10)]
     split = measure_split(pairs)
     expected = 20.0 * math.log10(255.0) - 10.0  # the mean of 20 log 255 and 20 log 25.5
     assert split.psnr is not None
@@ -109,7 +110,7 @@ def test_a_split_averages_decibels_and_not_errors() -> None:
 
 def test_a_perfect_image_marks_its_split_as_saturated() -> None:
     x = noise(5, 8, 8)
-    split = measure_split([("same", 0.0, x, x), ("other", 1.0, x, noise(6, 8, 8))])
+    split = measure_split([Pair("same", 0.0, x, x), Pair("other", 1.0, x, noise(6, 8, 8))])
     assert split.saturated
     assert split.views[0].psnr == 100.0
 
@@ -127,3 +128,50 @@ def test_without_a_distance_the_reason_is_that_none_was_requested(tmp_path: Path
     found = evaluate(tiny_scene(anchors=4), capture.train[:1], images, (1.0, 1.0, 1.0))
     assert (found.lpips_vgg, found.lpips_reason) == (None, "LPIPS was not requested")
     assert (found.flip_ldr, found.flip_reason) == (None, "FLIP was not requested")
+
+
+def test_masked_pixels_change_no_metric() -> None:
+    class Distance(torch.nn.Module):
+        def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+            return (a - b).abs().mean()
+
+    image, target = noise(7, 40, 48), noise(8, 40, 48)
+    valid = noise(9, 40, 48)[..., 0] > 0.4
+    spoiled = [np.where(valid[..., None], x, noise(seed, 40, 48)) for seed, x in ((10, image), (11, target))]
+    distances = PerceptualDistances(Lpips(Distance(), None), Flip(None, "not installed"))
+    whole = measure(Pair("v", 0.0, image, target, valid), distances)
+    assert whole.mse == pytest.approx(np.square(rounded(image) - rounded(target))[valid].mean(), rel=1e-12)
+    assert whole.compared == pytest.approx(valid.mean())
+    other = measure(Pair("v", 0.0, spoiled[0], target, valid), distances)
+    assert other == whole
+    without = measure(Pair("v", 0.0, spoiled[0], spoiled[1], valid))
+    assert (without.psnr, without.ssim_3dgs) == (whole.psnr, whole.ssim_3dgs)
+
+
+def test_a_mask_that_hides_nothing_changes_no_metric() -> None:
+    image, target = noise(7, 20, 24), noise(8, 20, 24)
+    whole = measure(Pair("v", 0.0, image, target))
+    all_valid = measure(Pair("v", 0.0, image, target, np.ones((20, 24), np.bool_)))
+    assert all_valid.psnr == whole.psnr
+    assert all_valid.ssim_3dgs == pytest.approx(whole.ssim_3dgs, abs=1e-13)
+
+
+def test_a_window_with_one_valid_pixel_compares_only_its_colour() -> None:
+    image, target = noise(7, 21, 21), noise(8, 21, 21)
+    valid = np.zeros((21, 21), np.bool_)
+    valid[10, 10] = True  # farther from the border than a window reaches
+    x, y = rounded(image)[10, 10], rounded(target)[10, 10]
+    luminance = (2 * x * y + 0.01**2) / (x**2 + y**2 + 0.01**2)
+    assert ssim_3dgs(image, target, valid) == pytest.approx(float(luminance.mean()), abs=1e-9)
+
+
+def test_a_view_that_is_masked_everywhere_is_left_out_of_the_means() -> None:
+    x, y = noise(1, 8, 8), noise(2, 8, 8)
+    nothing = np.zeros((8, 8), np.bool_)
+    split = measure_split([Pair("hidden", 0.0, x, y, nothing), Pair("seen", 0.5, x, y)])
+    assert [view.name for view in split.views] == ["seen"]
+    assert measure_split([Pair("hidden", 0.0, x, y, nothing)]).psnr is None
+
+
+def rounded(image: np.ndarray) -> np.ndarray:
+    return np.rint(image * 255) / 255

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from graings.evaluation.metrics import SplitMetrics, measure, measure_split
+from graings.evaluation.metrics import Pair, SplitMetrics, measure, measure_split
 from graings.evaluation.perceptual import VGG_FILE, Flip, Lpips, PerceptualDistances, _backbone_problem
 
 NO_FLIP = Flip(None, "not installed")
@@ -23,7 +23,7 @@ def test_absent_lpips_weights_are_named_and_never_fetched(tmp_path: Path, monkey
     lpips = Lpips.find()
     assert lpips.reason is not None
     assert lpips(noise(0, 40, 40), noise(1, 40, 40)) is None
-    split = measure_split([("v", 0.0, noise(0, 40, 40), noise(1, 40, 40))], PerceptualDistances(lpips, NO_FLIP))
+    split = measure_split([Pair("v", 0.0, noise(0, 40, 40), noise(1, 40, 40))], PerceptualDistances(lpips, NO_FLIP))
     assert split.lpips_vgg is None
     assert split.lpips_reason == lpips.reason
     assert list(tmp_path.iterdir()) == []
@@ -43,7 +43,7 @@ def test_images_too_small_for_the_network_have_no_lpips() -> None:
             return (a - b).abs().mean()
 
     distances = PerceptualDistances(Lpips(OneForAll(), None), NO_FLIP)
-    small, large = (measure("v", 0.0, noise(0, n, n), noise(1, n, n), distances) for n in (31, 32))
+    small, large = (measure(Pair("v", 0.0, noise(0, n, n), noise(1, n, n)), distances) for n in (31, 32))
     assert small.lpips_vgg is None
     assert large.lpips_vgg is not None
     split = SplitMetrics.over((small, large), distances)
@@ -72,8 +72,8 @@ def test_flip_is_0_for_equal_images_near_1_for_black_on_white_and_grows_with_the
 def test_flip_is_averaged_over_a_split() -> None:
     pytest.importorskip("flip_evaluator")
     distances = PerceptualDistances(Lpips(None, "not installed"), Flip.find())
-    pairs = [(f"v{i}", 0.0, noise(i, 16, 16), noise(9, 16, 16)) for i in range(2)]
+    pairs = [Pair(f"v{i}", 0.0, noise(i, 16, 16), noise(9, 16, 16)) for i in range(2)]
     split = measure_split(pairs, distances)
-    singles = [measure(*pair, distances).flip_ldr for pair in pairs]
+    singles = [measure(pair, distances).flip_ldr for pair in pairs]
     assert split.flip_ldr == pytest.approx(np.mean([value for value in singles if value is not None]), rel=1e-12)
     assert split.flip_reason is None

@@ -28,6 +28,7 @@ def write_fixed(folder: Path, draw: Draw, *, cameras: int = 1, times: int = 8, s
             write_image(folder / f"{name}.png", image)
             frames.append(entry(orbit(camera, max(cameras, 4), (size, size)), name, index / max(1, times - 1)))
     write_transforms(folder, "train", frames)
+    write_transforms(folder, "val", [])
     return folder
 
 

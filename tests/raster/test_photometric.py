@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -25,7 +26,7 @@ def pair(height: int, width: int, dtype: torch.dtype = torch.float64) -> tuple[T
 
 
 def with_gradient(
-    function: Callable[..., Tensor], image: Tensor, target: Tensor, **options: int
+    function: Callable[..., Tensor], image: Tensor, target: Tensor, **options: Any
 ) -> tuple[Tensor, Tensor]:
     leaf = image.clone().requires_grad_()
     value = function(leaf, target, **options)
@@ -171,3 +172,53 @@ def test_misuse_is_refused_by_name() -> None:
         ssim(image, target.float())
     with pytest.raises(ValueError, match="target must not require a gradient"):
         ssim(image, target.clone().requires_grad_())
+
+
+@pytest.mark.parametrize("module", [photometric_reference.photometric, photometric])
+def test_masked_pixels_change_neither_value_nor_gradient(module: Callable[..., Tensor]) -> None:
+    image, target = pair(33, 47)
+    valid = torch.zeros(33, 47, dtype=torch.bool)
+    valid[5:30, 8:40] = True
+    valid[10:14, 12:16] = False
+    value, gradient = with_gradient(module, image, target, ssim_weight=0.2, squared_weight=3.0, valid=valid)
+    assert gradient[~valid].abs().max() == 0
+    assert (gradient[valid] != 0).all()
+    other = torch.where(valid.unsqueeze(-1), target, torch.rand_like(target))
+    again, gradient_too = with_gradient(module, image, other, ssim_weight=0.2, squared_weight=3.0, valid=valid)
+    assert torch.equal(value, again)
+    assert torch.equal(gradient, gradient_too)
+
+
+def test_without_similarity_the_masked_loss_is_the_mean_over_valid_pixels() -> None:
+    image, target = pair(17, 33)
+    valid = torch.rand(17, 33, generator=torch.Generator().manual_seed(0)) > 0.4
+    value = photometric(image, target, 0.0, 2.0, valid=valid)
+    difference = (image - target)[valid]
+    torch.testing.assert_close(value, difference.abs().mean() + 2.0 * difference.square().mean(), rtol=1e-12, atol=0)
+
+
+def test_far_from_a_mask_similarity_is_that_of_the_valid_part() -> None:
+    image, target = pair(40, 60)
+    target[:, :30] = image[:, :30]  # the masked half differs by nothing in the whole image either
+    valid = torch.ones(40, 60, dtype=torch.bool)
+    valid[:, :30] = False
+    masked = photometric(image, target, 1.0, valid=valid)
+    torch.testing.assert_close(masked, 2 * photometric(image, target, 1.0), rtol=1e-12, atol=0)
+
+
+def test_the_loss_of_an_image_without_a_valid_pixel_is_zero() -> None:
+    image, target = pair(5, 5)
+    valid = torch.zeros(5, 5, dtype=torch.bool)
+    value, gradient = with_gradient(photometric, image, target, ssim_weight=0.2, squared_weight=1.0, valid=valid)
+    assert value.abs() < 1e-15
+    assert gradient.abs().max() == 0
+
+
+def test_both_implementations_agree_with_a_mask(isa: str) -> None:
+    image, target = pair(33, 47)
+    valid = torch.rand(33, 47, generator=torch.Generator().manual_seed(1)) > 0.3
+    options = {"ssim_weight": 0.4, "squared_weight": 1.5, "valid": valid}
+    value, gradient = with_gradient(photometric, image, target, **options)
+    expected, expected_gradient = with_gradient(photometric_reference.photometric, image, target, **options)
+    torch.testing.assert_close(value, expected, rtol=0, atol=1e-12)
+    assert relative(gradient, expected_gradient) < 1e-11

@@ -35,6 +35,7 @@ def snowman(folder: Path, *, alpha: bool = True) -> Path:
         write_image(folder / f"train/r_{index:03d}.png", pixels)
         entries.append(entry(orbit(index, 6, (SIDE, SIDE)), f"./train/r_{index:03d}", index / 5))
     write_transforms(folder, "train", entries)
+    write_transforms(folder, "val", [])
     return folder
 
 

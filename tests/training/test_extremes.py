@@ -51,6 +51,7 @@ def _painted(
         camera = orbit(index % (cameras or frames), cameras or frames, (SIDE, SIDE))
         entries.append(entry(camera, f"./train/r_{index:03d}", (index % (times or frames)) / max(frames - 1, 1)))
     write_transforms(folder, "train", entries)
+    write_transforms(folder, "val", [])
     return folder
 
 

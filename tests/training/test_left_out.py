@@ -177,6 +177,7 @@ def test_an_opaque_alpha_channel_is_left_out_without_changing_a_bit(tmp_path: Pa
         write_image(folder / f"train/r_{index:03d}.png", image)
         entries.append(entry(orbit(index, 6, (16, 16)), f"./train/r_{index:03d}", index / 5))
     write_transforms(folder, "train", entries)
+    write_transforms(folder, "val", [])
     found = []
     for options in ({}, {"plan.keep": ["alpha_loss"]}):
         run = TrainingRun.create(folder, tmp_path / str(len(found)), micro_config(iterations=20, **options))

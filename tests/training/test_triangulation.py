@@ -41,6 +41,7 @@ def _written(folder: Path, cameras: Sequence[Camera], images: Sequence[NDArray[n
         write_image(folder / f"train/{index:03d}.png", image)
         frames.append(entry(camera, f"train/{index:03d}", index / len(cameras)))
     write_transforms(folder, "train", frames)
+    write_transforms(folder, "val", [])
     return folder
 
 

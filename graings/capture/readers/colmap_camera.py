@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
-from graings.capture.image_file import ImageFile
 from graings.capture.lens import Lens
 from graings.errors import CaptureError
 
@@ -38,9 +37,6 @@ CAMERA_MODELS: Final[dict[int, tuple[str, int, int]]] = {
     16: ("EUCM", 6, 2),
 }
 MODELS: Final = {name: (count, focals) for name, count, focals in CAMERA_MODELS.values()}
-
-# Downscaling rounds the size of an image to whole pixels: aspect ratios may differ by this many px of the shorter side.
-ROUNDING_TOLERANCE: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +115,6 @@ class UndistortedCameras:
             return Camera(world_to_camera, *pinhole, *size), lens
         except ValueError as error:  # for example a focal length that overflows
             raise CaptureError(str(error), file=self.file, field=field, remedy="Correct the camera there.") from error
-
-
-def image_scale(image: ImageFile, width: float, height: float) -> tuple[float, float] | None:
-    """Size of `image` over the size in px for which its intrinsics are given; None where the aspect ratios differ."""
-    sx, sy = image.width / width, image.height / height
-    return None if abs(sx - sy) * min(width, height) > ROUNDING_TOLERANCE else (sx, sy)
 
 
 def undistortion_notes(lenses: Iterable[Lens | None]) -> list[str]:

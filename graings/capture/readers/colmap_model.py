@@ -166,6 +166,7 @@ def _cameras_txt(file: _Text) -> dict[int, ColmapCamera]:
 def _images_txt(file: _Text) -> tuple[ColmapImage, ...]:
     images = []
     skip = -1  # each image takes two lines; the second, its observations, may be empty
+    single = _lacks_observations(file)
     for number, line in file.rows():
         if number == skip:
             continue
@@ -175,12 +176,32 @@ def _images_txt(file: _Text) -> tuple[ColmapImage, ...]:
             camera, name = int(words[8]), words[9].strip()
         except (ValueError, IndexError):
             file.fail(number, "is no image (id, quaternion, translation, camera id, name)")
-        skip = number + 1
-        if skip < len(file.lines) and len(file.lines[skip].split()) % 3:
+        skip = -1 if single else number + 1
+        if not single and skip < len(file.lines) and len(file.lines[skip].split()) % 3:
             file.fail(skip, f"the observations of {name} are truncated")
         images.append(ColmapImage(name, camera, _pose(file.name, name, values)))
     file.finish(len(images))
     return tuple(images)
+
+
+def _lacks_observations(file: _Text) -> bool:
+    """Whether each image has one line only, as scripts write that do not know of the second.
+
+    Ten words or more whose last is no number are an image; observations are three numbers each.
+    """
+    return all(is_image_line(line) for _, line in file.rows()) and len(list(file.rows())) > 1
+
+
+def is_image_line(line: str) -> bool:
+    """Whether a line of images.txt is an image, not the observations of one."""
+    words = line.split(maxsplit=9)
+    try:
+        float(words[9])
+    except ValueError:
+        return True
+    except IndexError:
+        pass
+    return False
 
 
 def _points_txt(file: _Text) -> tuple[NDArray[np.float64], NDArray[np.float32]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -14,7 +15,11 @@ T = TypeVar("T")
 def parse_json(kind: TypeAdapter[T], data: bytes, file: str) -> T:
     """`data` as `kind`. Raises `CaptureError` with the first invalid field."""
     try:
-        return kind.validate_json(data.removeprefix(b"\xef\xbb\xbf"))
+        return kind.validate_json(data.decode(json.detect_encoding(data)))  # UTF-8, 16 or 32, with a mark or without
+    except UnicodeDecodeError as error:
+        raise CaptureError(
+            f"is not text ({error.reason})", file=file, remedy="Save it as UTF-8, or export the capture again."
+        ) from error
     except ValidationError as error:
         problems = error.errors(include_url=False, include_input=False, include_context=False)
         first = problems[0]

@@ -66,7 +66,10 @@ def missing_fraction(scene: Scene, frames: Sequence[Frame], images: ImageStore, 
     missing, prepared = 0, PreparedScene(scene)
     for frame in frames:
         render_ = render(prepared, frame.camera, frame.time, background).color
-        missing += has_missing_object(render_, torch.from_numpy(images.rgb(frame)))
+        image, valid = torch.from_numpy(images.rgb(frame)), images.valid(frame)
+        if valid is not None:
+            image = torch.where(torch.from_numpy(valid).unsqueeze(-1), image, render_)
+        missing += has_missing_object(render_, image)
     return missing / len(frames)
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from graings.capture.capture import Frame
+from graings.capture.mask import Mask
 from graings.config import TrainConfig
 from graings.raster.result import RenderResult
 from graings.report.events import Event, Grew, GrowthCapped, Pruned, Thinned
@@ -55,14 +56,24 @@ class DensityControl:
         compositions: Sequence[Composition],
         results: Sequence[RenderResult],
         offsets: Sequence[Tensor],
+        masks: Sequence[Mask | None] | None = None,
     ) -> None:
-        """Record the views of one step; `offsets` hold dL/d(projected centre), L being the mean over views."""
-        for frame, composition, result, offset in zip(frames, compositions, results, offsets, strict=True):
+        """Record the views of one step; `offsets` hold dL/d(projected centre), L being the mean over views.
+
+        `masks` are the valid pixels of each view: a Gaussian whose centre is elsewhere was not observed.
+        """
+        masks = masks or [None] * len(frames)
+        for frame, composition, result, offset, valid in zip(
+            frames, compositions, results, offsets, masks, strict=True
+        ):
             if offset.grad is not None:
+                visible = result.radii.amax(-1) > 0
+                if valid is not None:
+                    visible[visible.clone()] = _at(torch.from_numpy(valid), result.means2d[visible])
                 self.statistics.observe(
                     composition.children,
                     offset.grad * len(frames),  # of the view's own loss, not of the mean
-                    result.radii.amax(-1) > 0,
+                    visible,
                     composition.opacities,
                     (frame.camera.width, frame.camera.height),
                 )
@@ -141,3 +152,10 @@ class DensityControl:
         self.statistics.load(statistics)
         self.next_uid = int(facts["next_uid"])
         self.voxel_size = float(facts["voxel_size"])
+
+
+def _at(valid: Tensor, centers: Tensor) -> Tensor:
+    """Values of `valid` [H, W] at projected centres [n, 2] in px, of the nearest pixel outside the image."""
+    height, width = valid.shape
+    columns, rows = centers[:, 0].clamp(0, width - 1).long(), centers[:, 1].clamp(0, height - 1).long()
+    return valid[rows, columns]

@@ -36,6 +36,7 @@ from graings.training.initialization.visual_hull import (
     check_not_empty,
     coverage,
     masked,
+    not_masked,
     visual_hull,
 )
 
@@ -117,7 +118,9 @@ def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, st
     # inside of objects, and most of them are soon pruned.
     surface_limit = min(most, most_anchors(config))
     if capture.points is not None:
-        return InitialPoints(_subsampled(capture.points.positions, surface_limit, generator), window)
+        shown = not_masked(capture.points.positions, capture.train, images)
+        if len(shown):
+            return InitialPoints(_subsampled(shown, surface_limit, generator), window)
     half = content_half_size(capture)
     cube = (torch.rand(config.init.points, 3, generator=generator, dtype=torch.float64).numpy() * 2 - 1) * half
     if config.init.min_mask_fraction == 0:

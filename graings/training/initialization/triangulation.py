@@ -77,7 +77,7 @@ def triangulate(frames: Sequence[Frame], images: ImageStore) -> Triangulated:
     """
     extractor = _extractor()
     chosen = [_at_most(frames[index]) for index in _spread(len(frames), IMAGES)]
-    features = [_features(images.rgb(frame) @ LUMA, extractor) for frame in chosen]
+    features = [_features(images.rgb(frame) @ LUMA, images.valid(frame), extractor) for frame in chosen]
     cameras = [frame.camera for frame in chosen]
     first = np.cumsum([0] + [len(each.pixels) for each in features])  # index of each image's first feature
     points, links = [np.empty((0, 3))], [np.empty((2, 0), np.int64)]
@@ -90,16 +90,17 @@ def triangulate(frames: Sequence[Frame], images: ImageStore) -> Triangulated:
     track_ids, number = np.unique(tracks(ends, int(first[-1])), return_inverse=True)
     found = _medians(np.concatenate(points), number, len(track_ids))
     filled = [np.empty((0, 3))]
-    for camera, begin, end in zip(cameras, first[:-1], first[1:], strict=True):
+    for frame, begin, end in zip(chosen, first[:-1], first[1:], strict=True):
         own = ((ends >= begin) & (ends < end)).any(axis=0)
-        filled.append(fill_untextured(camera, found[np.unique(number[own])]))
+        filled.append(fill_untextured(frame.camera, found[np.unique(number[own])], images.valid(frame)))
     return Triangulated(found, np.concatenate(filled))
 
 
-def fill_untextured(camera: Camera, seen: Array) -> Array:
+def fill_untextured(camera: Camera, seen: Array, valid: NDArray[np.bool_] | None = None) -> Array:
     """A point [K, 3] for each cell of an image without any of the points `seen` [m, 3], at the depth of the nearest.
 
-    Surfaces without texture, a wall or the sky, have no features; growth needs anchors near them.
+    Cells whose middle is not `valid` [H, W] get none. Surfaces without texture, a wall or the sky, have no features;
+    growth needs anchors near them.
     """
     seen = seen[_in_front(camera, seen)]  # the median of a track need not be in front of every camera
     if len(seen) == 0:
@@ -110,6 +111,8 @@ def fill_untextured(camera: Camera, seen: Array) -> Array:
     middles = np.column_stack([u.ravel(), v.ravel()])
     apart = np.linalg.norm(middles[:, None] - pixels, axis=-1)
     empty = apart.min(axis=1) > size
+    if valid is not None:
+        empty &= _at(valid, middles)
     rays = _directions(camera, middles[empty])
     points: Array = camera.center + depths[apart.argmin(axis=1)[empty], None] * rays
     return points
@@ -157,10 +160,22 @@ def _at_most(frame: Frame) -> Frame:
     return replace(frame, camera=camera.resized(width, height))
 
 
-def _features(gray: NDArray[np.float32], extractor: pycolmap.FeatureExtractor) -> Features:
+def _features(
+    gray: NDArray[np.float32], valid: NDArray[np.bool_] | None, extractor: pycolmap.FeatureExtractor
+) -> Features:
     points, descriptors = extractor.extract_from_float32_array(gray)
     pixels = np.array([(point.x, point.y) for point in points], dtype=np.float64).reshape(-1, 2)
-    return Features(pixels, functional.normalize(torch.from_numpy(np.array(descriptors.data)).float(), dim=-1))
+    unit = functional.normalize(torch.from_numpy(np.array(descriptors.data)).float(), dim=-1)
+    if valid is None:
+        return Features(pixels, unit)
+    kept = _at(valid, pixels)
+    return Features(pixels[kept], unit[torch.from_numpy(kept)])
+
+
+def _at(valid: NDArray[np.bool_], pixels: Array) -> NDArray[np.bool_]:
+    """Values of `valid` [H, W] at positions [n, 2] (x, y) in px, of the nearest pixel outside the image."""
+    columns, rows = (np.clip(pixels[:, axis].astype(np.intp), 0, valid.shape[1 - axis] - 1) for axis in (0, 1))
+    return np.asarray(valid[rows, columns])
 
 
 def _neighbours(cameras: Sequence[Camera], times: Sequence[float]) -> Iterator[tuple[int, int]]:

@@ -46,11 +46,15 @@ MIN_VIEWS: Final = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskedFrame:
-    """A frame, its mask [H, W] (opaque, and not of the background colour), and whether any pixel is opaque."""
+    """A frame, its silhouette `mask` [H, W] (opaque, not of the background colour), and whether any pixel is opaque.
+
+    `valid` [H, W] are the pixels that the capture does not mask: others neither vote nor have to be covered.
+    """
 
     frame: Frame
     mask: NDArray[np.bool_]
     opaque: bool
+    valid: NDArray[np.bool_] | None = None
 
 
 def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> list[MaskedFrame]:
@@ -60,8 +64,24 @@ def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[flo
         alpha = images.alpha(frame)
         differs = np.abs(images.rgb(frame) - np.asarray(background, np.float32)).max(axis=-1) > COLOR_TOLERANCE
         opaque = np.ones_like(differs) if alpha is None else alpha > 0.5
-        found.append(MaskedFrame(frame, opaque & differs, bool(opaque.any())))
+        valid = images.valid(frame)
+        seen = opaque & differs if valid is None else opaque & differs & valid
+        found.append(MaskedFrame(frame, seen, bool(opaque.any()), valid))
     return found
+
+
+def not_masked(points: NDArray[np.float64], frames: Sequence[Frame], images: ImageStore) -> NDArray[np.float64]:
+    """Those of `points` [M, 3] that most of the `frames` that see them do not mask; points that none sees stay."""
+    if all(frame.mask_path is None for frame in frames):
+        return points
+    seen, shown = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
+    for frame in frames:
+        columns, rows, inside = _whole_pixels(points, frame.camera)
+        valid = images.valid(frame)
+        seen += inside
+        shown += inside if valid is None else inside & valid[rows, columns]
+    kept: NDArray[np.float64] = points[2 * shown >= seen]
+    return kept
 
 
 def check_not_empty(views: Sequence[MaskedFrame]) -> None:
@@ -104,6 +124,8 @@ def _mask_fractions(points: NDArray[np.float64], views: Sequence[MaskedFrame]) -
     for view in views:
         columns, rows, inside = _whole_pixels(points, view.frame.camera)
         mask = _dilated(view.mask, MASK_MARGIN)
+        if view.valid is not None:
+            inside &= view.valid[rows, columns]
         seen += inside
         votes[inside] += mask[rows[inside], columns[inside]]
     return np.where(seen > 0, votes / np.maximum(seen, 1), -1.0)
