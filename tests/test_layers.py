@@ -36,6 +36,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.evaluation": ("graings.capture", "graings.render", "graings.scene"),
     "graings.storage": ("graings.camera", "graings.config", "graings.scene"),
     "graings.export": ("graings.camera", "graings.render", "graings.scene", "graings.storage"),
+    "graings.player": ("graings.camera", "graings.export", "graings.render", "graings.scene", "graings.storage"),
     "graings.report": (
         *(
             "graings.camera",
@@ -61,8 +62,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
-        *("graings.export", "graings.footage", "graings.kernel", "graings.plan", "graings.render", "graings.report"),
-        *("graings.storage", "graings.training"),
+        *("graings.export", "graings.footage", "graings.kernel", "graings.plan", "graings.player", "graings.render"),
+        *("graings.report", "graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
     "jobs": (
@@ -72,8 +73,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
     # HTTP never trains.
     "service": (
-        *("graings.camera", "graings.capture", "graings.config", "graings.export", "graings.kernel", "graings.plan"),
-        *("graings.render", "graings.report", "graings.storage", "jobs"),
+        *("graings.camera", "graings.capture", "graings.config", "graings.evaluation", "graings.export"),
+        *("graings.kernel", "graings.plan", "graings.player", "graings.render", "graings.report", "graings.storage"),
+        "jobs",
     ),
 }
 

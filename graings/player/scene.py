@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -44,6 +45,15 @@ class UnitsFacts(Document):
     up: _Three = Field(description="Vertical axis, unit length.")
     time_start: float
     time_span: float = Field(description="0: the capture has a single time.")
+
+
+class CaptureFacts(Document):
+    """What a player needs to know of a capture to show pictures of it."""
+
+    units: UnitsFacts
+    background: _Three = Field(description="RGB in [0, 1].")
+    start: CameraFacts = Field(description="The first view.")
+    cameras: tuple[CameraFacts, ...] = Field(description="Training cameras, then held-out ones.")
 
 
 class SamplingFacts(Document):
@@ -91,9 +101,7 @@ class SceneHeader(Document):
     blur: float = Field(ge=0, description="Low-pass variance in px^2 at the reference sampling rate.")
     sampling: SamplingFacts
     raster: RasterFacts
-    background: _Three
-    units: UnitsFacts
-    cameras: tuple[CameraFacts, ...] = Field(description="Training cameras, then held-out ones.")
+    capture: CaptureFacts
     tables: tuple[Table, ...]
 
 
@@ -118,7 +126,7 @@ class PlayerScene:
     @property
     def degree(self) -> int:
         """Highest degree of the harmonics."""
-        return int(round(self.harmonics.shape[1] ** 0.5)) - 1
+        return math.isqrt(self.harmonics.shape[1]) - 1
 
     def __len__(self) -> int:
         return len(self.means)

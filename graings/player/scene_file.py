@@ -22,18 +22,10 @@ from torch import Tensor
 from graings.camera.camera import View
 from graings.camera.sampling_rate import RATE_TOLERANCE, SamplingRate
 from graings.errors import CheckpointError
-from graings.export.harmonics_fit import spread
 from graings.player.bake import Baked, bake, largest_rates, value_sizes
+from graings.player.capture_facts import capture_facts
 from graings.player.columns import Table, pack, unpack
-from graings.player.scene import (
-    CameraFacts,
-    PlayerScene,
-    PositionError,
-    RasterFacts,
-    SamplingFacts,
-    SceneHeader,
-    UnitsFacts,
-)
+from graings.player.scene import PlayerScene, PositionError, RasterFacts, SamplingFacts, SceneHeader
 from graings.render import PreparedScene
 from graings.scene.motion_basis import PLAYER_PIXELS
 from graings.scene.time_basis import TimeBasis, quantile
@@ -51,8 +43,6 @@ _LEVELS: Final = 2.0
 _LOG_SCALE: Final = 0.02
 _HARMONIC: Final = 0.025
 
-MOST_CAMERAS: Final = 60
-MOST_HELD_OUT: Final = 20
 _CHECKED_TIMES: Final = 16
 
 
@@ -69,7 +59,7 @@ def scene_bytes(model: Model, prepared: PreparedScene | None = None, *, pixels: 
     tables, body = _tables(baked)
     scene = baked.scene
     found = _scene({table.name: unpack(table, body) for table in tables}, scene.blur, scene.sampling)
-    units, sampling = model.units, scene.sampling
+    sampling = scene.sampling
     header = SceneHeader(
         schema="graings.player_scene/1",
         digest=model.digest,
@@ -91,15 +81,7 @@ def scene_bytes(model: Model, prepared: PreparedScene | None = None, *, pixels: 
             tolerance=RATE_TOLERANCE,
         ),
         raster=RasterFacts(),
-        background=model.background,
-        units=UnitsFacts(
-            center=units.center,
-            scale=units.scale,
-            up=units.up,
-            time_start=units.time_start,
-            time_span=units.time_span,
-        ),
-        cameras=tuple(_cameras(model)),
+        capture=capture_facts(model),
         tables=tables,
     )
     text = json.dumps(header.to_json(), separators=(",", ":"), allow_nan=False).encode()
@@ -194,20 +176,4 @@ def _position_error(
         exact[inverse] = prepared.geometry(time, rows)[0].to(found.means.dtype)
         errors.append((found.means_at(time) - exact).norm(dim=1) * rates)
     together = torch.stack(errors)
-    return PositionError(
-        rms=float(together.square().mean().sqrt()), p99=quantile(together), max=float(together.max())
-    )
-
-
-def _cameras(model: Model) -> Iterator[CameraFacts]:
-    for split, most in (("train", MOST_CAMERAS), ("val", MOST_HELD_OUT)):
-        views = model.views.get(split, ())
-        for index in spread(len(views), most):
-            camera = views[index].camera
-            yield CameraFacts(
-                name=f"{split}:{index}",
-                time=views[index].time,
-                world_to_camera=tuple(tuple(map(float, row)) for row in camera.world_to_camera[:3]),
-                intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-                size=(camera.width, camera.height),
-            )
+    return PositionError(rms=float(together.square().mean().sqrt()), p99=quantile(together), max=float(together.max()))
