@@ -47,7 +47,7 @@ class UnitsFacts(Document):
     time_span: float = Field(description="0: the capture has a single time.")
 
 
-class CaptureFacts(Document):
+class CaptureCameras(Document):
     """What a player needs to know of a capture to show pictures of it."""
 
     units: UnitsFacts
@@ -101,7 +101,7 @@ class SceneHeader(Document):
     blur: float = Field(ge=0, description="Low-pass variance in px^2 at the reference sampling rate.")
     sampling: SamplingFacts
     raster: RasterFacts
-    capture: CaptureFacts
+    capture: CaptureCameras
     tables: tuple[Table, ...]
 
 

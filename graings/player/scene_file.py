@@ -21,9 +21,10 @@ from torch import Tensor
 
 from graings.camera.camera import View
 from graings.camera.sampling_rate import RATE_TOLERANCE, SamplingRate
+from graings.document import first_problem
 from graings.errors import CheckpointError
 from graings.player.bake import Baked, bake, largest_rates, value_sizes
-from graings.player.capture_facts import capture_facts
+from graings.player.capture_cameras import capture_cameras
 from graings.player.columns import Table, pack, unpack
 from graings.player.scene import PlayerScene, PositionError, RasterFacts, SamplingFacts, SceneHeader
 from graings.render import PreparedScene
@@ -81,7 +82,7 @@ def scene_bytes(model: Model, prepared: PreparedScene | None = None, *, pixels: 
             tolerance=RATE_TOLERANCE,
         ),
         raster=RasterFacts(),
-        capture=capture_facts(model),
+        capture=capture_cameras(model),
         tables=tables,
     )
     text = json.dumps(header.to_json(), separators=(",", ":"), allow_nan=False).encode()
@@ -101,8 +102,9 @@ def read_scene(data: bytes) -> tuple[PlayerScene, SceneHeader]:
         tables = {table.name: unpack(table, body) for table in header.tables}
         sampling = SamplingRate(header.sampling.extent, header.sampling.reference, header.sampling.coarsest)
         return _scene(tables, header.blur, sampling), header
-    except (OSError, EOFError, zlib.error, struct.error, KeyError, ValueError, ValidationError) as error:
-        raise CheckpointError(f"no scene file, or a damaged one ({error}). Fetch or write it again.") from error
+    except (OSError, EOFError, zlib.error, struct.error, KeyError, ValueError) as error:
+        reason = first_problem(error) if isinstance(error, ValidationError) else error
+        raise CheckpointError(f"no scene file, or a damaged one ({reason}). Fetch or write it again.") from error
 
 
 def _tables(baked: Baked) -> tuple[tuple[Table, ...], bytes]:

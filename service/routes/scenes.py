@@ -8,8 +8,8 @@ from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import FileResponse
 
-from graings.player.capture_facts import capture_facts
-from graings.player.scene import CaptureFacts
+from graings.player.capture_cameras import capture_cameras
+from graings.player.scene import CaptureCameras
 from graings.player.scene_file import MEDIA_TYPE
 from service.comparison import compare
 from service.context import Context, ContextDep, JobId
@@ -69,9 +69,9 @@ async def scene(
 
 
 @router.get("/views", operation_id="get_views")
-def views(job_id: JobId, context: ContextDep) -> CaptureFacts:
+def views(job_id: JobId, context: ContextDep) -> CaptureCameras:
     """Units, background and cameras of the capture, with which a player shows pictures before it has the scene."""
-    return capture_facts(_loaded(context, job_id).model)
+    return capture_cameras(_loaded(context, job_id).model)
 
 
 @router.get("/comparison", operation_id="get_comparison", response_class=Response, responses=_COMPARISON)

@@ -26,7 +26,7 @@ from tests.service.test_jobs import problem
 
 # Without any key: the page signs in, and probes of an operator have none.
 OPEN = {"get_health", "get_readiness", "get_session", "begin_session", "end_session"}
-LOOKS = {"get_job", "list_jobs", "get_events", "render"}  # all that a link allows
+LOOKS = {"get_job", "list_jobs", "get_events", "render", "get_scene", "get_views"}  # all that a link allows
 CALLERS = ("no key", "view", "read", "train", "admin", "other", "wrong")
 NOT_FOUND = "0000000000000000"
 

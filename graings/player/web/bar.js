@@ -64,7 +64,7 @@ export class Bar {
     this.background.addEventListener("change", paint);
     this.color.addEventListener("input", paint);
     this.share = button("Link", "Copy a link to this view and time", actions.share);
-    this.full = button("⛶", "Full screen", actions.fullscreen);
+    this.full = button("Full", "Full screen", actions.fullscreen);
     this.full.hidden = !document.fullscreenEnabled;
     this.root = element(
       "div",

@@ -19,6 +19,7 @@ export class Pictures {
     this.image = image;
     this.report = report;
     this.busy = false;
+    this.failed = false;
     this.wanted = null;
     this.number = 0;
     this.alone = true; // whether nothing else is shown: then a picture of an earlier view is better than none
@@ -63,8 +64,10 @@ export class Pictures {
         await this.image.decode();
         if (old) URL.revokeObjectURL(old);
         if (number === this.number || this.alone) this.image.classList.add("shown");
-        this.report(null);
+        if (this.failed) this.report(null);
+        this.failed = false;
       } catch (error) {
+        this.failed = true;
         this.report(error);
         await new Promise((resolve) => setTimeout(resolve, 1000));
       }

@@ -6,16 +6,14 @@ import { listen } from "./gestures.js";
 import { copy, stateFrom, stateText } from "./link.js";
 import { Pictures, rgb } from "./pictures.js";
 import { Renderer } from "./renderer.js";
+import { Resolution } from "./resolution.js";
 import { download, readScene } from "./scene_file.js";
 import { Sorter } from "./sorter.js";
 
-const PLAY_SECONDS = 4; // from the first to the last time at speed 1
+const PLAY_MS = 4000; // from the first to the last time at speed 1
 const SETTLE_MS = 300; // without a change, until the server is asked for the exact picture
 const DRAFT_SIDE = 256; // of the server's pictures while something changes
 const EXACT_SIDE = 1024;
-const SLOW_MS = 60; // a frame that takes longer lowers the resolution of moving pictures
-const QUICK_MS = 25;
-const LEAST_SCALE = 0.25;
 
 export class Player {
   /**
@@ -26,10 +24,9 @@ export class Player {
    * @param {() => void} [options.settled] called when the view or the time has been changed
    */
   constructor(root, { worker, link, settled = () => {} }) {
-    Object.assign(this, { worker, link, settled });
-    Object.assign(this, { facts: null, renderer: null, sorter: null, pictures: null });
+    Object.assign(this, { root, worker, link, settled, facts: null, renderer: null, sorter: null, pictures: null });
     Object.assign(this, { view: null, time: 0, playing: false, looping: true, speed: 1, background: null, held: false });
-    Object.assign(this, { dirty: false, stale: false, moving: false, scale: 1, frame: 0, before: 0, timer: 0, loads: 0 });
+    Object.assign(this, { dirty: false, stale: false, moving: false, resolution: new Resolution(), frame: 0, before: 0, timer: 0, loads: 0 });
     this.canvas = element("canvas", { "aria-hidden": "true" });
     this.image = element("img", { alt: "", draggable: "false" });
     this.message = element("p", { class: "message", role: "status" });
@@ -48,7 +45,6 @@ export class Player {
       share: () => copy(this.link(this.state), (text) => this.say(text)),
       fullscreen: () => this.fullscreen(),
     });
-    this.root = root;
     root.classList.add("player");
     root.append(this.stage, this.bar.root);
     const changed = (change) => (...numbers) => {
@@ -60,10 +56,7 @@ export class Player {
       orbit: changed((view, yaw, pitch) => orbit(view, this.facts.units.up, yaw, pitch)),
       pan: changed(pan),
       zoom: changed(zoom),
-      hold: (held) => {
-        this.held = held;
-        this.change();
-      },
+      hold: (held) => this.change(held),
       reset: () => this.reset(),
       keys: {
         " ": () => this.play(!this.playing),
@@ -74,24 +67,20 @@ export class Player {
       },
     });
     new ResizeObserver(() => this.change()).observe(this.stage);
-    matchMedia("(prefers-reduced-motion: reduce)").matches && root.classList.add("calm");
   }
 
   /**
    * Show a capture through the server's pictures: what its cameras see.
    * @param {any} facts cameras, units and background, as scene files have them
    * @param {string | null} pictures address of /render with its job; null: there is no server
-   * @param {boolean} keep whether view and time stay as they are
    */
-  open(facts, pictures, keep = false) {
+  open(facts, pictures) {
     this.facts = facts;
     this.pictures = pictures && new Pictures(pictures, this.image, (error) => this.say(error ? error.message : ""));
     this.bar.list(facts.cameras);
     this.bar.enable(true);
-    if (!keep || !this.view) {
-      this.view = viewpointOf(facts.start);
-      this.setTime(0);
-    }
+    this.view = viewpointOf(facts.start);
+    this.setTime(0);
     this.change();
   }
 
@@ -126,6 +115,7 @@ export class Player {
       renderer.setOrder(order);
       // What was shown before remains until the new scene can be drawn.
       if (this.sorter !== sorter && wanted()) this.show({ canvas, renderer, sorter });
+      else if (this.sorter !== sorter) sorter.close();
       this.dirty = true;
       this.wake();
     });
@@ -139,8 +129,16 @@ export class Player {
     Object.assign(this, { canvas, renderer, sorter });
     if (this.pictures) this.pictures.alone = false;
     this.root.dataset.ready = renderer.scene.header.digest;
-    const milliseconds = renderer.measure(this.camera(window.devicePixelRatio), this.time, this.colors);
-    this.scale = Math.min(1, Math.max(LEAST_SCALE, Math.sqrt(SLOW_MS / milliseconds)));
+    this.resolution.begin(renderer.measure(this.camera(window.devicePixelRatio), this.time, this.colors));
+    canvas.addEventListener("webglcontextlost", () => this.renderer === renderer && this.lose());
+    this.change();
+  }
+
+  /** The browser has taken the graphics memory away: the server's pictures remain. */
+  lose() {
+    this.release();
+    if (this.pictures) this.pictures.alone = true;
+    else this.say("The browser has stopped drawing. Reload the page.");
     this.change();
   }
 
@@ -156,6 +154,7 @@ export class Player {
   clear(message = "") {
     this.loads++;
     this.play(false);
+    clearTimeout(this.timer);
     this.release();
     this.pictures?.hide();
     Object.assign(this, { facts: null, pictures: null, view: null });
@@ -182,8 +181,7 @@ export class Player {
   }
 
   setTime(time) {
-    this.time = time;
-    this.bar.showTime(time);
+    this.bar.showTime((this.time = time));
   }
 
   play(on) {
@@ -239,8 +237,9 @@ export class Player {
     return this.background ?? this.facts.background;
   }
 
-  /** Something is not as it was drawn. */
-  change() {
+  /** Something is not as it was drawn: the view, the time, the background, or whether a hand holds it. */
+  change(held = this.held) {
+    this.held = held;
     this.dirty = this.stale = this.moving = true;
     if (this.renderer) this.pictures?.hide();
     clearTimeout(this.timer);
@@ -264,8 +263,7 @@ export class Player {
     this.frame = 0;
     if (!this.facts) return;
     if (this.playing && (this.renderer || !this.pictures?.busy)) {
-      if (this.before) this.advance((now - this.before) / 1000);
-      if (this.before && this.renderer) this.adapt(now - this.before);
+      if (this.before) this.advance(now - this.before);
       this.before = now;
     }
     if (this.dirty || this.playing) {
@@ -278,32 +276,25 @@ export class Player {
   }
 
   drawScene() {
-    const camera = this.camera(window.devicePixelRatio * (this.moving ? this.scale : 1));
+    const { scale } = this.resolution;
+    const camera = this.camera(window.devicePixelRatio * (this.moving ? scale : 1));
     if (this.stale) this.sorter.sort(camera, this.time);
-    this.renderer.draw(camera, this.time, this.colors, !this.moving || this.scale === 1);
+    this.renderer.draw(camera, this.time, this.colors, !this.moving || scale === 1);
   }
 
-  /** Fewer pixels while pictures move, if the machine needs it. */
-  adapt(milliseconds) {
-    if (milliseconds > SLOW_MS) this.scale = Math.max(LEAST_SCALE, this.scale * 0.8);
-    else if (milliseconds < QUICK_MS) this.scale = Math.min(1, this.scale * 1.02);
-  }
-
-  advance(seconds) {
-    const next = this.time + (seconds * this.speed) / PLAY_SECONDS;
-    if (next >= 1 && !this.looping) {
-      this.setTime(1);
-      this.play(false);
-    } else {
-      this.setTime(next % 1);
-    }
+  advance(milliseconds) {
+    if (this.renderer) this.resolution.adapt(milliseconds);
+    const next = this.time + (milliseconds * this.speed) / PLAY_MS;
+    const ends = next >= 1 && !this.looping;
+    this.setTime(ends ? 1 : next % 1);
+    if (ends) this.play(false);
     this.stale = true;
   }
 
   /** The server's picture of this view, of at most `side` pixels. */
   exact(scale, side) {
     if (!this.pictures) return;
-    const longest = Math.max(this.stage.clientWidth, this.stage.clientHeight);
-    this.pictures.show(this.camera(Math.min(scale, side / longest)), this.time, this.colors, this.facts.units);
+    const most = side / Math.max(this.stage.clientWidth, this.stage.clientHeight);
+    this.pictures.show(this.camera(Math.min(scale, most)), this.time, this.colors, this.facts.units);
   }
 }

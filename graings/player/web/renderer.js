@@ -2,7 +2,9 @@
 
 import { relativeRate, undersampling } from "./camera.js";
 import { functionsAt } from "./scene_file.js";
-import * as shaders from "./shaders.js";
+import {
+  COPY_FRAGMENT, COPY_VERTEX, DRAWING_VERTEX, NOTHING, STATE_TEXELS, TEXTURE_WIDTH, drawingFragment, evaluationShader,
+} from "./shaders.js";
 
 const MAX_PARTS = 4; // samples for each pixel along each axis
 const MAX_SIDE = 4096; // of the supersampled picture, in px
@@ -22,7 +24,7 @@ export class Renderer {
    * @param {import("./scene_file.js").Scene} scene
    */
   constructor(canvas, scene) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
     if (!gl) throw new Error("This browser has no WebGL2.");
     this.gl = gl;
     this.canvas = canvas;
@@ -35,9 +37,9 @@ export class Renderer {
     this.vectors = new Float32Array(4 * vectors);
     this.geometry = new Float32Array(10 * geometry.rank);
     this.residual = new Float32Array(4 * residual.rank);
-    this.evaluation = program(gl, shaders.evaluationShader(header), shaders.NOTHING, ["place", "shape", "color"]);
-    this.drawing = program(gl, shaders.DRAWING_VERTEX, shaders.drawingFragment(header.raster));
-    this.copying = program(gl, shaders.COPY_VERTEX, shaders.COPY_FRAGMENT);
+    this.evaluation = program(gl, evaluationShader(header), NOTHING, ["place", "shape", "color"]);
+    this.drawing = program(gl, DRAWING_VERTEX, drawingFragment(header.raster));
+    this.copying = program(gl, COPY_VERTEX, COPY_FRAGMENT);
     this.upload();
     this.arrange();
     this.target = null;
@@ -49,7 +51,7 @@ export class Renderer {
     const { gl, scene } = this;
     const { count, means, quats, logScales, opacities, harmonics, header } = scene;
     const of = (table, column, i) => table[column * count + i];
-    const states = table(count, shaders.STATE_TEXELS, (data, at, i) => {
+    const states = table(count, STATE_TEXELS, (data, at, i) => {
       for (let axis = 0; axis < 3; axis++) {
         data[at + axis] = of(means, axis, i);
         data[at + 8 + axis] = of(logScales, axis, i);
@@ -75,8 +77,8 @@ export class Renderer {
     textures.forEach(([name, data, format], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       texture(gl);
-      const height = data.length / 4 / shaders.TEXTURE_WIDTH;
-      gl.texImage2D(gl.TEXTURE_2D, 0, format, shaders.TEXTURE_WIDTH, height, 0, gl.RGBA, gl.FLOAT, data);
+      const height = data.length / 4 / TEXTURE_WIDTH;
+      gl.texImage2D(gl.TEXTURE_2D, 0, format, TEXTURE_WIDTH, height, 0, gl.RGBA, gl.FLOAT, data);
       gl.uniform1i(gl.getUniformLocation(this.evaluation, name), unit);
     });
     gl.activeTexture(gl.TEXTURE0 + textures.length);
@@ -252,8 +254,8 @@ function enlarged(camera, parts) {
 
 /** Rows of `texels` texels, in whole lines of a texture. */
 function table(rows, texels, fill) {
-  const lines = Math.max(1, Math.ceil((rows * texels) / shaders.TEXTURE_WIDTH));
-  const data = new Float32Array(4 * lines * shaders.TEXTURE_WIDTH);
+  const lines = Math.max(1, Math.ceil((rows * texels) / TEXTURE_WIDTH));
+  const data = new Float32Array(4 * lines * TEXTURE_WIDTH);
   for (let i = 0; i < rows; i++) fill(data, 4 * texels * i, i);
   return data;
 }

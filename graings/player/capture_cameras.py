@@ -1,4 +1,4 @@
-"""capture_facts: what a player needs to know of a model's capture; it takes no time to gather."""
+"""capture_cameras: what a player needs to know of a model's capture; it takes no time to gather."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Final
 from graings.camera.camera import View
 from graings.camera.viewpoint import orbit_view
 from graings.export.harmonics_fit import spread
-from graings.player.scene import CameraFacts, CaptureFacts, UnitsFacts
+from graings.player.scene import CameraFacts, CaptureCameras, UnitsFacts
 from graings.storage.model import Model
 
 START_AZIMUTH: Final = 30.0  # degrees
 MOST: Final = {"train": 60, "val": 20}  # cameras of each split
 
 
-def capture_facts(model: Model) -> CaptureFacts:
+def capture_cameras(model: Model) -> CaptureCameras:
     """Units, background and cameras of the capture, and the view that a player begins with."""
     units = model.units
     start = orbit_view(model.views["train"], units, START_AZIMUTH, None, None, None, None, None, None)
-    return CaptureFacts(
+    return CaptureCameras(
         units=UnitsFacts(
             center=units.center,
             scale=units.scale,
