@@ -45,6 +45,11 @@ class JobFolder:
         return self.path / "run"
 
     @property
+    def capture(self) -> Path:
+        """The capture that was made of a video or of photographs."""
+        return self.path / "capture"
+
+    @property
     def log(self) -> Path:
         return self.path / "log.txt"
 

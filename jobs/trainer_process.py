@@ -29,6 +29,7 @@ from graings.training.calibration import calibration
 from graings.training.run import TrainingRun
 from graings.training.run_output import RunReport
 from jobs.exit_code import ExitCode
+from jobs.footage_phase import Stopped, capture_of
 from jobs.locks import locked
 from jobs.parent import watch_parent
 from jobs.progress import ProgressReport, ProgressWriter
@@ -68,6 +69,9 @@ def _train_or_report(folder: JobFolder, threads: int, stop: threading.Event) -> 
     """Train, and turn any error into an exit code and a message."""
     try:
         return _train(folder, threads, stop)
+    except Stopped:
+        _log("stopped while the capture was made; it continues there")
+        return ExitCode.STOPPED
     except DivergedError as error:
         return _end(ExitCode.DIVERGED, str(error))
     except GraingsError as error:
@@ -82,11 +86,14 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     spec = folder.spec()
     config = restored(TrainConfig, spec.config, folder.path)
     threads = min(config.threads or threads, threads)
-    capture = Store(folder.path.parent.parent).capture(spec.capture)
+    upload = Store(folder.path.parent.parent).capture(spec.capture)
     checkpoint = folder.checkpoint()
     attempts = folder.attempts()
     attempt = attempts[-1].number if attempts else 1
     progress = ProgressWriter(folder.progress)
+    capture, found = capture_of(upload, folder, threads, config.iterations, progress, stop)
+    for line in found:
+        _log(line)
     progress.write(
         ProgressReport(phase="loading", iteration=checkpoint or 0, iterations=config.iterations, attempt=attempt)
     )

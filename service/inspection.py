@@ -15,6 +15,7 @@ from anyio import BrokenWorkerProcess, to_process
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig, TrainConfig
 from graings.errors import CaptureError
+from graings.footage.source import find_footage
 from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan
 from graings.plan.survey import survey
@@ -54,6 +55,8 @@ async def _apart(look: Callable[[Path, Options], _Defect | str | None], folder: 
 
 def _find_defect(folder: Path, config: CaptureConfig) -> _Defect | None:
     root = capture_root(folder)
+    if find_footage(root) is not None:
+        return None  # the job finds its cameras first, and says there what is wrong
     try:
         load_capture(root, config)
     except CaptureError as error:
@@ -64,6 +67,9 @@ def _find_defect(folder: Path, config: CaptureConfig) -> _Defect | None:
 def _make_plan(folder: Path, config: TrainConfig) -> _Defect | str:
     """The plan as JSON. The service measures no times itself: it uses the calibration of an earlier training."""
     root = capture_root(folder)
+    if (footage := find_footage(root)) is not None:
+        remedy = "Submit it as a job, or make a capture of it first: graings capture."
+        return "a plan needs the cameras, which are not known yet", footage.name, None, remedy
     try:
         return survey(root, config, stored_calibration()).model_dump_json(by_alias=True)
     except CaptureError as error:

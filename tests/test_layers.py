@@ -12,6 +12,7 @@ PACKAGES = ("graings", "jobs", "service")
 # What everybody may use, whichever package it is in.
 GROUND = (
     "graings",
+    "graings.colmap",
     "graings.constants",
     "graings.document",
     "graings.errors",
@@ -69,11 +70,12 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.config", "graings.document", "graings.report.events", "graings.storage.files"),
         "graings.storage.run_folder",
     ),
+    "jobs.footage_phase": ("graings.footage", "jobs"),
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
     # HTTP never trains.
     "service": (
-        *("graings.camera", "graings.capture", "graings.config", "graings.export", "graings.kernel", "graings.plan"),
-        *("graings.render", "graings.report", "graings.storage", "jobs"),
+        *("graings.camera", "graings.capture", "graings.config", "graings.export", "graings.footage.source"),
+        *("graings.kernel", "graings.plan", "graings.render", "graings.report", "graings.storage", "jobs"),
     ),
 }
 
@@ -88,7 +90,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "typer": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
     "rich": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
     "OpenImageIO": ("graings.capture", "graings.footage.photos", "graings.image_encoding"),
-    "pycolmap": ("graings.capture", "graings.footage", "graings.training.initialization"),
+    "pycolmap": ("graings.capture", "graings.colmap", "graings.footage", "graings.training.initialization"),
     "av": ("graings.footage.video",),
     "lpips": ("graings.evaluation.perceptual",),
     "flip_evaluator": ("graings.evaluation.perceptual",),

@@ -19,6 +19,7 @@ from torch.nn import functional
 from graings.camera.camera import Camera
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
+from graings.colmap import import_pycolmap
 
 if TYPE_CHECKING:
     import pycolmap
@@ -138,9 +139,7 @@ def _medians(points: Array, number: NDArray[np.int64], count: int) -> Array:
 
 
 def _extractor() -> pycolmap.FeatureExtractor:
-    import pycolmap  # optional extra: importing it at the top would make every capture depend on it
-
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value  # it logs every start
+    pycolmap = import_pycolmap()  # optional extra: importing it at the top would make every capture depend on it
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = MAX_FEATURES
     return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
