@@ -25,7 +25,7 @@ from graings.scene.scene import Composed, Scene
 from graings.scene.splats import Splats
 
 # Errors of fast images, for 99 % of the children and times: in the training views, and in grey levels.
-FAST_PIXELS: Final = 0.1
+FAST_PIXELS: Final = 0.2
 FAST_LEVELS: Final = 1.0
 
 # Upper bound of the supersampled image: four pixels for each of 1920 x 1080, in 200 MB.
