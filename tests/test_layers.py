@@ -34,7 +34,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.plan": ("graings.capture", "graings.config"),
     "graings.evaluation": ("graings.capture", "graings.render", "graings.scene"),
     "graings.storage": ("graings.camera", "graings.config", "graings.scene"),
-    "graings.export": ("graings.camera", "graings.render", "graings.scene", "graings.storage"),
+    "graings.export": ("graings.camera", "graings.raster", "graings.render", "graings.scene", "graings.storage"),
     "graings.report": (
         *(
             "graings.camera",
@@ -84,8 +84,15 @@ HOMES: dict[str, tuple[str, ...]] = {
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
     "typer": (
-        *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.synthesize"),
-        *("graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
+        *("graings.cli.exporting", "graings.cli.main", "graings.cli.option_table", "graings.cli.planning"),
+        *(
+            "graings.cli.rendering",
+            "graings.cli.synthesize",
+            "graings.cli.training",
+            "jobs.commands",
+            "service.commands",
+            "service.demo",
+        ),
     ),
     "rich": (
         *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.progress"),
@@ -96,11 +103,14 @@ HOMES: dict[str, tuple[str, ...]] = {
     "pycolmap": ("graings.capture", "graings.training.initialization"),
     "lpips": ("graings.evaluation.metrics",),
     "matplotlib": ("graings.report", "graings.ablation.plot"),
+    "plyfile": ("graings.capture.readers.ply", "graings.export.ply"),
+    "gaussforge": ("graings.export.formats",),
+    "av": ("graings.export",),
     "safetensors": ("graings.storage.checkpoint", "graings.storage.compact"),
 }
 
 # Optional extras, and what takes long to import and is not always used.
-MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "matplotlib"}
+MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "matplotlib", "gaussforge", "av"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 
