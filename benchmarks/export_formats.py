@@ -139,8 +139,13 @@ def formats(options: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
             splats = glb_rows(file.read_bytes())
             command = ["node", "-e", VALIDATE, str(file)]
             issues = json.loads(subprocess.check_output(command, cwd=options.node_modules.parent))
-            verdict = f"{issues['numErrors']} errors, {issues['numWarnings']} warnings, {issues['numInfos']} infos"
-            print(json.dumps(issues["messages"][:3]))
+            # The validator does not know the extension yet, so it calls the names of its attributes invalid.
+            unknown = [m for m in issues["messages"] if m["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE"]
+            unknown = [m for m in unknown if "/KHR_gaussian_splatting:" in m["pointer"]]
+            verdict = (
+                f"{len(unknown)} names of the extension unknown; else {issues['numErrors'] - len(unknown)} errors, "
+            )
+            verdict += f"{issues['numWarnings']} warnings"
         else:
             tool = options.node_modules / "@playcanvas/splat-transform/bin/cli.mjs"
             subprocess.run(["node", str(tool), "-q", "-w", str(file), str(back)], check=True, capture_output=True)

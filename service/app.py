@@ -16,7 +16,7 @@ from service import problems
 from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
-from service.routes import jobs, plans, render, results, system
+from service.routes import export, jobs, plans, render, results, system
 from service.same_origin import SameOrigin
 from service.settings import Settings
 
@@ -55,7 +55,7 @@ def create_app(settings: Settings) -> FastAPI:
     problems.install(app)
     # Added last, so that it comes first: a refused request costs next to nothing.
     app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
-    for routes in (jobs, plans, results, render, system):
+    for routes in (jobs, plans, results, export, render, system):
         app.include_router(routes.router)
     app.mount("/web", StaticFiles(directory=system.WEB), name="web")
     return app

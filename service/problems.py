@@ -59,6 +59,12 @@ class NotYet(ServiceError):
     """A result that the job does not have yet."""
 
 
+class Busy(ServiceError):
+    """The service does as much of this kind as it can."""
+
+    headers: ClassVar[dict[str, str] | None] = {"Retry-After": "5"}
+
+
 class NotAcceptable(ServiceError):
     """The service has no format that the client accepts."""
 
@@ -73,6 +79,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (ArchiveError, 422, "capture-rejected"),
     (TooLarge, 413, "too-large"),
     (NotYet, 404, "not-yet"),
+    (Busy, 503, "busy"),
     (NotAcceptable, 406, "not-acceptable"),
     (ClientDisconnect, 400, "disconnected"),
     (ConfigError, 422, "bad-config"),

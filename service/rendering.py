@@ -15,12 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from graings.camera.camera import Camera
 from graings.errors import CheckpointError
-from graings.image_encoding import ImageFormat, encode_image
-from graings.render import PreparedScene, render
+from graings.export.picture import Content, picture
+from graings.image_encoding import ImageFormat
+from graings.render import PreparedScene
 from graings.storage.compact import open_model
 from graings.storage.model import Model, scene_bytes
 from graings.storage.run_folder import newest_model
@@ -39,6 +38,7 @@ class RenderRequest:
     time: float
     background: tuple[float, float, float]
     format: ImageFormat
+    content: Content = "color"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,8 +150,8 @@ def _lower_priority() -> None:
 
 
 def _rendered(loaded: LoadedModel, request: RenderRequest) -> bytes:
-    result = render(loaded.scene, request.camera, request.time, request.background)
-    return encode_image(np.asarray(result.color, dtype=np.float32), request.format)
+    view = (request.camera, request.time, request.background)
+    return picture(loaded.scene, *view, loaded.model.units, request.content, request.format)
 
 
 def _key(path: Path) -> _Key | None:

@@ -85,19 +85,13 @@ HOMES: dict[str, tuple[str, ...]] = {
     "werkzeug": ("service.routes.render",),
     "typer": (
         *("graings.cli.exporting", "graings.cli.main", "graings.cli.option_table", "graings.cli.planning"),
-        *(
-            "graings.cli.rendering",
-            "graings.cli.synthesize",
-            "graings.cli.training",
-            "jobs.commands",
-            "service.commands",
-            "service.demo",
-        ),
+        *("graings.cli.rendering", "graings.cli.synthesize", "graings.cli.training", "graings.cli.video"),
+        *("jobs.commands", "service.commands", "service.demo"),
     ),
     "rich": (
         *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.progress"),
-        "graings.cli.synthesize",
-        *("graings.cli.terminal", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
+        *("graings.cli.synthesize", "graings.cli.terminal", "graings.cli.training", "graings.cli.video"),
+        *("jobs.commands", "service.commands", "service.demo"),
     ),
     "OpenImageIO": ("graings.capture", "graings.image_encoding"),
     "pycolmap": ("graings.capture", "graings.training.initialization"),

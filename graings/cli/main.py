@@ -26,6 +26,7 @@ from graings.cli.rendering import render_view
 from graings.cli.synthesize import synthesize
 from graings.cli.terminal import metrics_line, motion_line, print_line
 from graings.cli.training import MultiValueCommand, Threads, ablate, train
+from graings.cli.video import video
 from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
 from graings.kernel import use_threads
 from graings.report.evaluate_run import evaluate_run
@@ -86,6 +87,7 @@ app.command()(plan)
 app.command()(synthesize)
 app.command(cls=MultiValueCommand)(ablate)
 app.command(name="render")(render_view)
+app.command()(video)
 app.command()(export)
 app.command(name="options")(show_options)
 

@@ -13,7 +13,7 @@ from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.cli.terminal import print_line
 from graings.cli.training import Threads
 from graings.export.picture import Content, check_content, picture
-from graings.export.shown import open_shown
+from graings.export.shown import UP, open_shown
 from graings.image_encoding import image_format
 from graings.kernel import use_threads
 
@@ -61,7 +61,7 @@ def render_view(
     ] = "color",
     up: Annotated[
         tuple[float, float, float], typer.Option(metavar="X Y Z", help="Vertical axis of a file of splats.")
-    ] = (0.0, -1.0, 0.0),
+    ] = UP,
     threads: Threads = None,
 ) -> None:
     """Render one view at one time; without --camera or --pose, an orbit around the scene."""
