@@ -93,6 +93,12 @@ class NotYet(ServiceError):
     """A result that the job does not have yet."""
 
 
+class Busy(ServiceError):
+    """The service does as much of this kind as it can."""
+
+    headers = MappingProxyType({"Retry-After": "5"})
+
+
 class NotAcceptable(ServiceError):
     """The service has no format that the client accepts."""
 
@@ -110,6 +116,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (Unauthorized, 401, "no-key"),
     (Forbidden, 403, "not-allowed"),
     (TooManyRequests, 429, "too-many-requests"),
+    (Busy, 503, "busy"),
     (NotAcceptable, 406, "not-acceptable"),
     (ClientDisconnect, 400, "disconnected"),
     (ConfigError, 422, "bad-config"),

@@ -84,7 +84,7 @@ def job_summary(job: Job) -> JobSummary:
     elif job.state is not JobState.SUCCEEDED:
         links["retry"] = f"{base}/retry"
     if job.checkpoint is not None or job.has_model:
-        links["render"] = f"/render?job={job.id}"
+        links |= {"render": f"/render?job={job.id}", "export": f"{base}/export?format=ply"}
     if job.has_plan:
         links["plan"] = f"{base}/plan"
     if job.has_metrics:

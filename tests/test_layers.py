@@ -36,7 +36,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.plan": ("graings.capture", "graings.config"),
     "graings.evaluation": ("graings.capture", "graings.render", "graings.scene"),
     "graings.storage": ("graings.camera", "graings.config", "graings.scene"),
-    "graings.export": ("graings.camera", "graings.render", "graings.scene", "graings.storage"),
+    "graings.export": ("graings.camera", "graings.raster", "graings.render", "graings.scene", "graings.storage"),
     "graings.report": (
         *(
             "graings.camera",
@@ -91,15 +91,17 @@ HOMES: dict[str, tuple[str, ...]] = {
     "rich": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
     "OpenImageIO": ("graings.capture", "graings.footage.photos", "graings.image_encoding"),
     "pycolmap": ("graings.capture", "graings.colmap", "graings.footage", "graings.training.initialization"),
-    "av": ("graings.footage.video",),
     "lpips": ("graings.evaluation.perceptual",),
     "flip_evaluator": ("graings.evaluation.perceptual",),
     "matplotlib": ("graings.report", "graings.ablation.plot"),
+    "plyfile": ("graings.capture.readers.ply", "graings.export.ply"),
+    "gaussforge": ("graings.export.formats",),
+    "av": ("graings.export", "graings.footage.video"),
     "safetensors": ("graings.storage.checkpoint", "graings.storage.compact"),
 }
 
 # Optional extras, and what takes long to import and is not always used.
-MAY_BE_IMPORTED_LATE = {"av", "pycolmap", "lpips", "flip_evaluator", "matplotlib"}
+MAY_BE_IMPORTED_LATE = {"av", "pycolmap", "lpips", "flip_evaluator", "gaussforge", "matplotlib"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 
