@@ -23,6 +23,7 @@ from rich.text import Text
 from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.camera.viewpoint import background_rgb
 from graings.cli.footage import capture
+from graings.cli.inspecting import inspect
 from graings.cli.option_table import show_options
 from graings.cli.planning import plan
 from graings.cli.synthesize import synthesize
@@ -93,6 +94,7 @@ def graings() -> None:
 
 app.command()(train)
 app.command()(plan)
+app.command()(inspect)
 app.command()(synthesize)
 app.command()(capture)
 app.command(cls=MultiValueCommand)(ablate)
