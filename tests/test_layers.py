@@ -33,7 +33,12 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.scene": ("graings.camera", "graings.config", "graings.kernel"),
     "graings.raster": ("graings.camera", "graings.kernel"),
     "graings.render": ("graings.camera", "graings.raster", "graings.scene"),  # they meet here and nowhere else
+    "graings.matching": ("graings.camera", "graings.capture"),
     "graings.plan": ("graings.capture", "graings.config"),
+    "graings.inspection": (
+        *("graings.camera", "graings.capture", "graings.config", "graings.matching", "graings.plan"),
+        *("graings.report.figure_files", "graings.scene.memory"),
+    ),
     "graings.evaluation": ("graings.capture", "graings.render", "graings.scene"),
     "graings.storage": ("graings.camera", "graings.config", "graings.scene"),
     "graings.export": ("graings.camera", "graings.raster", "graings.render", "graings.scene", "graings.storage"),
@@ -55,6 +60,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
             "graings.config",
             "graings.evaluation",
             "graings.kernel",
+            "graings.matching",
             "graings.plan",
         ),
         *("graings.raster", "graings.render", "graings.report", "graings.scene", "graings.storage"),
@@ -62,8 +68,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
-        *("graings.export", "graings.footage", "graings.kernel", "graings.plan", "graings.render", "graings.report"),
-        *("graings.storage", "graings.training"),
+        *("graings.export", "graings.footage", "graings.inspection", "graings.kernel", "graings.plan"),
+        *("graings.render", "graings.report", "graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
     "jobs": (
@@ -90,10 +96,10 @@ HOMES: dict[str, tuple[str, ...]] = {
     "typer": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
     "rich": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
     "OpenImageIO": ("graings.capture", "graings.footage.photos", "graings.image_encoding"),
-    "pycolmap": ("graings.capture", "graings.colmap", "graings.footage", "graings.training.initialization"),
+    "pycolmap": ("graings.capture", "graings.colmap", "graings.footage", "graings.matching"),
     "lpips": ("graings.evaluation.perceptual",),
     "flip_evaluator": ("graings.evaluation.perceptual",),
-    "matplotlib": ("graings.report", "graings.ablation.plot"),
+    "matplotlib": ("graings.report", "graings.ablation.plot", "graings.inspection.picture"),
     "plyfile": ("graings.capture.readers.ply", "graings.export.ply"),
     "gaussforge": ("graings.export.formats",),
     "av": ("graings.export", "graings.footage.video"),

@@ -21,6 +21,7 @@ from rich.text import Text
 from graings.camera.viewpoint import background_rgb
 from graings.cli.exporting import export
 from graings.cli.footage import capture
+from graings.cli.inspecting import inspect
 from graings.cli.option_table import show_options
 from graings.cli.planning import plan
 from graings.cli.rendering import render_view
@@ -85,6 +86,7 @@ def graings() -> None:
 
 app.command()(train)
 app.command()(plan)
+app.command()(inspect)
 app.command()(synthesize)
 app.command()(capture)
 app.command(cls=MultiValueCommand)(ablate)
