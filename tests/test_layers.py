@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("graings", "jobs", "service")
+PACKAGES = ("graings", "jobs", "service", "client")
 
 # What everybody may use, whichever package it is in.
 GROUND = (
@@ -68,8 +68,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "graings.storage.run_folder",
     ),
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
+    # What a program elsewhere uses: it knows nothing but HTTP.
+    "client": (),
     # HTTP never trains.
     "service": (
+        "client",
         *("graings.camera", "graings.capture", "graings.config", "graings.kernel", "graings.plan", "graings.render"),
         *("graings.report", "graings.storage", "jobs"),
     ),
@@ -83,6 +86,8 @@ HOMES: dict[str, tuple[str, ...]] = {
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
     "limits": ("service.request_limits",),
+    "httpx2": ("client",),
+    "PIL": ("client.calls",),
     "typer": (
         *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.synthesize"),
         *("graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
@@ -103,7 +108,7 @@ HOMES: dict[str, tuple[str, ...]] = {
 }
 
 # Optional extras, and what takes long to import and is not always used.
-MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "flip_evaluator", "matplotlib"}
+MAY_BE_IMPORTED_LATE = {"pycolmap", "lpips", "flip_evaluator", "matplotlib", "numpy", "PIL"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 
