@@ -116,6 +116,10 @@ class AsyncClient:
     async def retry(self, job_id: str) -> RemoteJob:
         return await self._do(calls.change(job_id, "retry"))
 
+    async def extend(self, job_id: str, iterations: int) -> RemoteJob:
+        """Train a job that has succeeded for so many more iterations."""
+        return await self._do(calls.extend(job_id, iterations))
+
     async def delete(self, job_id: str) -> None:
         await self._do(calls.delete(job_id))
 

@@ -116,6 +116,10 @@ class Client:
     def retry(self, job_id: str) -> RemoteJob:
         return self._do(calls.change(job_id, "retry"))
 
+    def extend(self, job_id: str, iterations: int) -> RemoteJob:
+        """Train a job that has succeeded for so many more iterations."""
+        return self._do(calls.extend(job_id, iterations))
+
     def delete(self, job_id: str) -> None:
         self._do(calls.delete(job_id))
 

@@ -78,6 +78,10 @@ def change(job_id: str, verb: str) -> Call[RemoteJob]:
     return Call("POST", f"/jobs/{job_id}/{verb}", _job)
 
 
+def extend(job_id: str, iterations: int) -> Call[RemoteJob]:
+    return Call("POST", f"/jobs/{job_id}/extend", _job, {"iterations": iterations})
+
+
 def delete(job_id: str) -> Call[None]:
     return Call("DELETE", f"/jobs/{job_id}", lambda response: None)
 

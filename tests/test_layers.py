@@ -67,12 +67,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.config", "graings.document", "graings.report.events", "graings.storage.files"),
         "graings.storage.run_folder",
     ),
-    "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
+    "jobs.trainer_process": ("graings.config", "graings.report", "graings.storage", "graings.training", "jobs"),
     # What a program elsewhere uses: it knows nothing but HTTP.
     "client": (),
     # HTTP never trains.
     "service": (
-        "client",
         *("graings.camera", "graings.capture", "graings.config", "graings.kernel", "graings.plan", "graings.render"),
         *("graings.report", "graings.storage", "jobs"),
     ),
@@ -86,17 +85,18 @@ HOMES: dict[str, tuple[str, ...]] = {
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
     "limits": ("service.request_limits",),
-    "httpx2": ("client",),
+    "httpx2": ("client", "jobs.webhooks"),
+    "standardwebhooks": ("jobs.webhooks",),
     "PIL": ("client.calls",),
     "typer": (
         *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.synthesize"),
-        *("graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
+        *("graings.cli.training", "jobs.commands", "service.commands", "client.demo"),
         "service.key_commands",
     ),
     "rich": (
         *("graings.cli.main", "graings.cli.option_table", "graings.cli.planning", "graings.cli.progress"),
         "graings.cli.synthesize",
-        *("graings.cli.terminal", "graings.cli.training", "jobs.commands", "service.commands", "service.demo"),
+        *("graings.cli.terminal", "graings.cli.training", "jobs.commands", "service.commands", "client.demo"),
         "service.key_commands",
     ),
     "OpenImageIO": ("graings.capture", "graings.image_encoding"),

@@ -38,6 +38,8 @@ def test_a_job_is_uploaded_trained_and_rendered_over_http(tmp_path: Path, captur
                 metrics = client.download(job.id, "metrics", tmp_path / "metrics.json")
                 assert json.loads(metrics.read_text())["iterations"] == 12
                 assert client.render(job.id, camera="val:0", format="png")[:4] == b"\x89PNG"
+                job = client.wait(client.extend(job.id, 6).id)
+                assert (job.state, job.error, job.checkpoint) == ("succeeded", None, 18)
             process.send_signal(signal.SIGTERM)
             assert process.wait(LONG_S) == 0
             with pytest.raises(ProcessLookupError):  # it took its worker along

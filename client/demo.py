@@ -1,7 +1,7 @@
 """The command `demo`: train a synthetic moving scene over HTTP and fetch views of it.
 
-It starts the service and a worker as `graings serve --with-worker` does, draws the synthetic capture, submits it,
-shows the progress of training, and fetches views and metrics. It uses the REST interface like any other client.
+It draws the capture and starts the service by their commands, and is then a client like any other: it submits the
+capture, shows the progress of training, and fetches views and metrics.
 """
 
 from __future__ import annotations
@@ -21,12 +21,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from client import Client, ClientError, Event
-from graings.capture.synthetic import synthesize
-from graings.kernel.threads import usable_cores
-from jobs.job import JobState
+
+GRAINGS = [sys.executable, "-m", "graings"]
 
 # About a minute of training on two cores.
 PRESET = "draft"
@@ -80,7 +79,7 @@ def _train(url: str, client: Client, folder: Path, console: Console) -> str:
     """Submit the capture and wait for the end of the job; returns its id."""
     capture = folder / SCENE
     if not capture.exists():
-        _draw_capture(capture, console)
+        _draw_capture(capture)
     console.print(f"Capture: {capture} ({VIEWS} training images of {SIZE} px)")
     job = client.submit(capture, preset=PRESET, config=OPTIONS)
     console.print(f"Job:     {url}/jobs/{job.id}")
@@ -102,25 +101,17 @@ def _train(url: str, client: Client, folder: Path, console: Console) -> str:
                 progress.update(bar, completed=report["iteration"], phase=report["phase"], details=details)
 
         job = client.wait(job.id, show)
-    if job.state != JobState.SUCCEEDED:
+    if job.state != "succeeded":
         raise DemoError(f"the job has {job.state}: {job.error}. Its log: {url}/jobs/{job.id}/log")
     return job.id
 
 
-def _draw_capture(capture: Path, console: Console) -> None:
+def _draw_capture(capture: Path) -> None:
     part = capture.with_suffix(".part")  # renamed when complete, so that a partial capture is not used
     shutil.rmtree(part, ignore_errors=True)
-    columns = (TextColumn("    draw"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as progress:
-        bar = progress.add_task("draw", total=None)
-        synthesize(
-            SCENE,
-            part,
-            size=SIZE,
-            views=VIEWS,
-            processes=usable_cores(),
-            observe=lambda done, total: progress.update(bar, completed=done, total=total),
-        )
+    command = [*GRAINGS, "synthesize", SCENE, "-o", str(part), "--size", str(SIZE), "--views", str(VIEWS)]
+    if subprocess.run(command).returncode != 0:
+        raise DemoError("the synthetic capture could not be drawn")
     part.rename(capture)
 
 
@@ -143,7 +134,7 @@ def _service(data: Path, log: Path) -> Iterator[tuple[str, Client]]:
     """Service and worker as child processes, which end with the context; the address and a client of it."""
     data.mkdir(parents=True, exist_ok=True)
     port = _free_port()
-    command = [sys.executable, "-m", "service.commands", "--with-worker", "--exit-with-parent"]
+    command = [*GRAINGS, "serve", "--with-worker", "--exit-with-parent"]
     command += ["--data", str(data), "--port", str(port)]
     with log.open("ab") as output:
         # In its own session: a Ctrl-C reaches only this process, which then stops the children.
