@@ -19,7 +19,7 @@ The last checkpoint is always kept, and a job that is queued again continues fro
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -64,11 +64,16 @@ class JobConflict(JobError):
     """The job's state does not allow the request."""
 
 
+class OtherSubmission(JobError):
+    """The key of a submission was used for another one."""
+
+
 @dataclass(frozen=True, slots=True)
 class JobSpec:
     """A submitted job. `capture` is the SHA-256 of the uploaded archive, `config` a whole `TrainConfig` as JSON.
 
     Jobs with a lower `priority` start first. `owner` is the key that submitted it; None for nobody's.
+    `webhook` is the address that is told what happens to it, with a secret to sign that.
     """
 
     name: str
@@ -76,6 +81,12 @@ class JobSpec:
     config: dict[str, Any]
     priority: int = 10
     owner: str | None = None
+    webhook: str | None = None
+    webhook_secret: str | None = None
+
+    def extended(self, iterations: int) -> JobSpec:
+        """The same with so many more iterations."""
+        return replace(self, config={**self.config, "iterations": self.config["iterations"] + iterations})
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,6 +48,9 @@ class ProgressReport(Document):
     iterations_per_s: Number = Field(None, description="Iterations per second over the last few seconds.")
     eta_s: Number = Field(None, description="Seconds of training left at this rate.")
     train_s: Number = Field(None, description="Seconds of training so far, evaluations not counted.")
+    phase_s: dict[str, float] = Field(
+        default_factory=dict, description="Seconds spent in each phase so far, by all attempts, evaluations included."
+    )
     held_out_psnr: Number = Field(None, description="PSNR of the last evaluation of this attempt, in dB.")
     held_out_ssim_3dgs: Number = Field(None, description="SSIM of the last evaluation of this attempt.")
     events: tuple[Event, ...] = Field((), description="What happened in the last step, beside an ordinary step.")

@@ -17,6 +17,7 @@ from service.access import authorize
 from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
+from service.head import Head
 from service.routes import export, jobs, plans, render, results, sessions, system
 from service.same_origin import SameOrigin
 from service.security_headers import SecurityHeaders
@@ -59,6 +60,7 @@ def create_app(settings: Settings) -> FastAPI:
     problems.install(app)
     # Added last, so that it comes first: a refused request costs next to nothing.
     app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
+    app.add_middleware(Head)
     app.add_middleware(SecurityHeaders)
     for routes in (jobs, plans, results, export, render, sessions, system):
         app.include_router(routes.router, dependencies=[Depends(authorize)])

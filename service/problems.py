@@ -18,9 +18,10 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
+from starlette.routing import Match, Mount
 
 from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError
-from jobs.job import JobConflict, JobDamaged, JobError, JobNotFound
+from jobs.job import JobConflict, JobDamaged, JobError, JobNotFound, OtherSubmission
 
 LOG = logging.getLogger(__name__)
 
@@ -108,6 +109,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (JobNotFound, 404, "no-such-job"),
     (JobConflict, 409, "state-conflict"),
     (JobDamaged, 500, "job-damaged"),
+    (OtherSubmission, 422, "idempotency-key-reused"),
     (JobError, 503, "jobs-unavailable"),
     (BadRequest, 422, "bad-parameter"),
     (ArchiveError, 422, "capture-rejected"),
@@ -185,7 +187,8 @@ def install(app: FastAPI) -> None:
         assert isinstance(error, HTTPException)
         phrase = HTTPStatus(error.status_code).phrase
         detail = _DETAILS.get(error.status_code) if error.detail == phrase else str(error.detail)
-        return problem(request, error.status_code, detail, headers=dict(error.headers) if error.headers else None)
+        headers = {"Allow": _allowed(request)} if error.status_code == 405 else error.headers
+        return problem(request, error.status_code, detail, headers=headers)
 
     async def validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
@@ -211,6 +214,19 @@ def install(app: FastAPI) -> None:
     # Starlette's own handler for all errors raises the error again after its response, and a server then drops the
     # connection. This one does not.
     app.add_middleware(_CatchAll, answer=unexpected)
+
+
+def _allowed(request: Request) -> str:
+    """The methods of an address: the framework names only those of the first route that has it."""
+
+    def match(method: str) -> bool:
+        scope = {**request.scope, "method": method}
+        return any(
+            route.matches(scope)[0] is Match.FULL for route in request.app.routes if not isinstance(route, Mount)
+        )
+
+    methods = [method for method in ("GET", "POST", "PUT", "PATCH", "DELETE") if match(method)] or ["GET"]
+    return ", ".join(["HEAD", *methods] if "GET" in methods else methods)
 
 
 class _CatchAll:

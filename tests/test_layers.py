@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("graings", "jobs", "service")
+PACKAGES = ("graings", "jobs", "service", "client")
 
 # What everybody may use, whichever package it is in.
 GROUND = (
@@ -77,7 +77,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "graings.storage.run_folder",
     ),
     "jobs.footage_phase": ("graings.footage", "jobs"),
-    "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
+    "jobs.trainer_process": ("graings.config", "graings.report", "graings.storage", "graings.training", "jobs"),
+    # What a program elsewhere uses: it knows nothing but HTTP.
+    "client": (),
     # HTTP never trains.
     "service": (
         *("graings.camera", "graings.capture", "graings.config", "graings.export", "graings.footage.source"),
@@ -93,8 +95,11 @@ HOMES: dict[str, tuple[str, ...]] = {
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
     "limits": ("service.request_limits",),
-    "typer": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
-    "rich": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
+    "httpx2": ("client", "jobs.webhooks"),
+    "standardwebhooks": ("jobs.webhooks",),
+    "PIL": ("client.calls",),
+    "typer": ("graings.cli", "jobs.commands", "service.commands", "client.demo", "service.key_commands"),
+    "rich": ("graings.cli", "jobs.commands", "service.commands", "client.demo", "service.key_commands"),
     "OpenImageIO": ("graings.capture", "graings.footage.photos", "graings.image_encoding"),
     "pycolmap": ("graings.capture", "graings.colmap", "graings.footage", "graings.matching"),
     "lpips": ("graings.evaluation.perceptual",),
@@ -107,7 +112,7 @@ HOMES: dict[str, tuple[str, ...]] = {
 }
 
 # Optional extras, and what takes long to import and is not always used.
-MAY_BE_IMPORTED_LATE = {"av", "pycolmap", "lpips", "flip_evaluator", "gaussforge", "matplotlib"}
+MAY_BE_IMPORTED_LATE = {"av", "gaussforge", "pycolmap", "lpips", "flip_evaluator", "matplotlib", "numpy", "PIL"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 

@@ -6,10 +6,11 @@ from typing import Annotated
 from urllib.parse import urlencode
 
 from anyio import to_thread
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Header, Query, Request, Response
+from pydantic import HttpUrl
 
 from graings.config import PRESETS, make_config
-from jobs.job import ID_PATTERN, JobSpec
+from jobs.job import ID_PATTERN, JobSpec, JobState
 from service.access import CallerDep
 from service.context import ContextDep, JobId
 from service.inspection import inspect_capture
@@ -34,6 +35,13 @@ async def submit(
     ] = None,
     priority: Annotated[int, Query(ge=1, le=1_000_000, description="Jobs with a lower number start first.")] = 10,
     name: Annotated[str, Query(min_length=1, max_length=120, description="Name of the job, for people.")] = "untitled",
+    webhook: Annotated[
+        HttpUrl | None, Query(description="Where to POST what happens to the job; signed with its `webhook_secret`.")
+    ] = None,
+    idempotency_key: Annotated[
+        str | None,
+        Header(max_length=255, description="Of the client's choice: the same request with it again makes no new job."),
+    ] = None,
 ) -> JobResource:
     """Queue a training job on the capture in the body: an archive, or a multipart form with one as `capture`."""
     overrides = {} if config is None else parse_config(config, "config")
@@ -42,11 +50,12 @@ async def submit(
     async with receive_capture(request, context.store.uploads, context.limits) as upload:
         chosen = make_config(preset, {**overrides, **upload.config})
         await inspect_capture(upload.folder, chosen.capture)
-        spec = JobSpec(name, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner)
-        job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder)
+        webhook_address = None if webhook is None else str(webhook)
+        spec = JobSpec(name, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
+        job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder, idempotency_key)
     response.headers["Location"] = f"/jobs/{job.id}"
     response.headers["Retry-After"] = RETRY_AFTER_S
-    return job_resource(job)
+    return job_resource(job).model_copy(update={"webhook_secret": job.spec.webhook_secret})
 
 
 @router.get("", operation_id="list_jobs")
@@ -55,11 +64,18 @@ def page(
     caller: CallerDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(pattern=ID_PATTERN, description="From `next` of the previous page.")] = None,
+    state: Annotated[list[JobState], Query(description="Only jobs in one of these states.")] = [],  # noqa: B006
+    name: Annotated[str | None, Query(max_length=120, description="Only jobs with this in their name.")] = None,
 ) -> JobPage:
     """Jobs, newest first."""
-    jobs, after = context.jobs.page(limit, cursor, wanted=caller.sees)
-    following = None if after is None else "/jobs?" + urlencode({"limit": limit, "cursor": after})
-    return JobPage(jobs=[job_summary(job) for job in jobs], next=following)
+    part = (name or "").casefold()
+
+    def wanted(job_id: str, spec: JobSpec) -> bool:
+        return part in spec.name.casefold() and caller.sees(job_id, spec)
+
+    jobs, after = context.jobs.page(limit, cursor, wanted=wanted, states=state)
+    following = {"limit": limit, "state": state, "name": name or [], "cursor": after}
+    return JobPage(jobs=[job_summary(job) for job in jobs], next=after and "/jobs?" + urlencode(following, doseq=True))
 
 
 @router.get("/{job_id}", operation_id="get_job")
@@ -87,6 +103,16 @@ def resume(job_id: JobId, context: ContextDep) -> JobResource:
 def retry(job_id: JobId, context: ContextDep) -> JobResource:
     """Queue a failed or diverged job again; it continues from its last checkpoint, if any."""
     return job_resource(context.jobs.retry(job_id))
+
+
+@router.post("/{job_id}/extend", status_code=202, operation_id="extend_job")
+def extend(
+    job_id: JobId,
+    context: ContextDep,
+    iterations: Annotated[int, Query(ge=1, le=1_000_000, description="How many more.")],
+) -> JobResource:
+    """Train a job that has succeeded for more iterations, from its last checkpoint; its model stays until then."""
+    return job_resource(context.jobs.extend(job_id, iterations))
 
 
 @router.delete("/{job_id}", status_code=204, operation_id="delete_job")
