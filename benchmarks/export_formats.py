@@ -131,7 +131,7 @@ def formats(options: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     fitted = [render(fit, camera, options.time, model.background).color for camera in cameras]
     quality = sum(map(psnr, truth, fitted)) / len(cameras)
     rows = [{"format": "(fit, ours)", "bytes": "", "own blur": f"{quality:.1f}", "0.3 px": "", "validator": ""}]
-    for name in WRITERS:
+    for name in options.formats:
         file, back = folder / f"scene.{name}", folder / f"{name}.back.ply"
         file.write_bytes(export_splats(model, ExportRequest(name, time=options.time)).data)
         verdict = ""
@@ -178,6 +178,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, nargs="?")
     parser.add_argument("--ply", type=Path)
     parser.add_argument("--time", type=float, default=0.3)
+    parser.add_argument("--formats", nargs="+", choices=list(WRITERS), default=list(WRITERS))
     parser.add_argument("--views", type=int, default=3)
     parser.add_argument("--size", type=int, default=400, help="px, for --ply")
     parser.add_argument("--node-modules", type=Path, default=Path("node_modules"))
