@@ -31,7 +31,7 @@ _REQUEST: Final = {field.name for field in fields(ViewRequest)} - {"background"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Key:
+class PathKey:
     """A camera (normalised units) and a time in [0, 1], or None where the file names none."""
 
     camera: Camera
@@ -50,7 +50,7 @@ def frames_of(shown: Shown, request: ViewRequest, path: str, moves: Moves, count
         raise ValueError(f"a video needs at least one frame, got {count}")
     first, time, _ = request.resolve(shown.views, shown.units, shown.background)
     if moves == "time":
-        cameras: list[Key] = [Key(first, None)] * count
+        cameras: list[PathKey] = [PathKey(first, None)] * count
     elif path == ORBIT:
         if not request.is_orbit:
             raise ValueError(
@@ -58,9 +58,9 @@ def frames_of(shown: Shown, request: ViewRequest, path: str, moves: Moves, count
             )
         start = request.azimuth or 0.0
         turned = (replace(request, azimuth=start + 360.0 * index / count) for index in range(count))
-        cameras = [Key(one.resolve(shown.views, shown.units, shown.background)[0], None) for one in turned]
+        cameras = [PathKey(one.resolve(shown.views, shown.units, shown.background)[0], None) for one in turned]
     elif path == VIEWS:
-        chosen = [Key(sized(view.camera, request.width, request.height), None) for view in around(shown)]
+        chosen = [PathKey(sized(view.camera, request.width, request.height), None) for view in around(shown)]
         cameras = spline(chosen, count, closed=True)
     else:
         cameras = _from_file(Path(path), shown, request, count)
@@ -83,7 +83,7 @@ def around(shown: Shown) -> list[View]:
     return [views[index * len(views) // kept] for index in range(kept)]
 
 
-def spline(keys: Sequence[Key], count: int, *, closed: bool = False) -> list[Key]:
+def spline(keys: Sequence[PathKey], count: int, *, closed: bool = False) -> list[PathKey]:
     """`count` cameras along a Catmull-Rom spline through `keys`, at equal distances of the parameter.
 
     Positions, rotations (projected onto the nearest rotation), log focal lengths and times are interpolated; the image
@@ -107,7 +107,7 @@ def spline(keys: Sequence[Key], count: int, *, closed: bool = False) -> list[Key
         fx, fy = np.exp(row[12:14])
         camera = Camera(pose, float(fx), float(fy), float(row[14]), float(row[15]), size.width, size.height)
         moment = None if times is None else float(np.interp(place, np.arange(len(keys)), times))
-        found.append(Key(camera, moment))
+        found.append(PathKey(camera, moment))
     return found
 
 
@@ -126,7 +126,7 @@ def _catmull_rom(rows: NDArray[np.float64], place: float, closed: bool) -> NDArr
     return found
 
 
-def _from_file(path: Path, shown: Shown, request: ViewRequest, count: int) -> list[Key]:
+def _from_file(path: Path, shown: Shown, request: ViewRequest, count: int) -> list[PathKey]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(document, dict):
@@ -143,17 +143,17 @@ def _from_file(path: Path, shown: Shown, request: ViewRequest, count: int) -> li
         raise CheckpointError(f"{path}: no camera path ({error}). {_REMEDY}") from error
 
 
-def _key(entry: dict[str, Any], shown: Shown, request: ViewRequest) -> Key:
+def _key(entry: dict[str, Any], shown: Shown, request: ViewRequest) -> PathKey:
     """A key is what `ViewRequest` takes: a named view, an orbit or a pose, and `t`."""
     unknown = set(entry) - _REQUEST
     if unknown:
         raise ValueError(f"a key has no {', '.join(sorted(unknown))}; it has {', '.join(sorted(_REQUEST))}")
     size = {"width": request.width, "height": request.height}
     camera, time, _ = ViewRequest(**size | entry).resolve(shown.views, shown.units, shown.background)
-    return Key(camera, time if "t" in entry else None)
+    return PathKey(camera, time if "t" in entry else None)
 
 
-def _nerfstudio(document: dict[str, Any], shown: Shown, request: ViewRequest) -> list[Key]:
+def _nerfstudio(document: dict[str, Any], shown: Shown, request: ViewRequest) -> list[PathKey]:
     """Every frame of a camera_path.json: camera_to_world (4x4, OpenGL axes) and the vertical field of view."""
     width, height = int(document["render_width"]), int(document["render_height"])
     keys = []
@@ -164,7 +164,7 @@ def _nerfstudio(document: dict[str, Any], shown: Shown, request: ViewRequest) ->
         matrix = shown.units.camera(np.linalg.inv(pose))
         camera = Camera(matrix, focal, focal, width / 2, height / 2, width, height)
         time = entry.get("render_time")
-        keys.append(Key(sized(camera, request.width, request.height), None if time is None else float(time)))
+        keys.append(PathKey(sized(camera, request.width, request.height), None if time is None else float(time)))
     if not keys:
         raise ValueError("camera_path is empty")
     return keys

@@ -15,7 +15,7 @@ import pytest
 from graings.camera.camera import Camera
 from graings.camera.view_request import ViewRequest
 from graings.errors import CheckpointError
-from graings.export.camera_path import Key, frames_of, spline
+from graings.export.camera_path import PathKey, frames_of, spline
 from graings.export.shown import Shown
 from graings.export.video import CODECS, check_video, write_video
 from graings.render import PreparedScene, render
@@ -55,7 +55,7 @@ def test_a_path_through_views_is_smooth_closed_and_looks_at_the_scene() -> None:
 
 
 def test_a_spline_passes_through_its_keys() -> None:
-    keys = [Key(camera, time) for camera, time in zip(ring(4), (0.0, 0.2, 0.9, 1.0), strict=True)]
+    keys = [PathKey(camera, time) for camera, time in zip(ring(4), (0.0, 0.2, 0.9, 1.0), strict=True)]
     found = spline(keys, 10)
     for index, key in enumerate(keys):
         np.testing.assert_allclose(found[3 * index].camera.world_to_camera, key.camera.world_to_camera, atol=1e-9)
