@@ -46,8 +46,8 @@ class JobQueue:
                     continue
                 self._engine.enqueue(job_id, priority)
 
-    def submit(self, spec: JobSpec, unpacked: Path) -> Job:
-        """A new job on the capture in the folder `unpacked`, which is moved into the store."""
+    def submit(self, spec: JobSpec, unpacked: Path | None) -> Job:
+        """A new job on the capture in the folder `unpacked`, which is moved into the store; None: on one it has."""
         job_id = self.store.create(spec, unpacked)
         try:
             self._engine.enqueue(job_id, spec.priority)

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from graings.storage.files import sync_folder, sync_tree, write_json
 from graings.storage.run_folder import MODEL_FILE, PLAN_FILE, newest_checkpoint
-from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
+from jobs.job import Attempt, CaptureNotFound, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
 from jobs.locks import locked
 
 LOG = logging.getLogger(__name__)
@@ -149,14 +149,21 @@ class Store:
         """The folder with the files of a capture."""
         return capture_root(self._captures / digest)
 
-    def create(self, spec: JobSpec, unpacked: Path) -> str:
-        """Add a job whose capture is in the folder `unpacked`, which is moved into the store. Returns the id."""
+    def create(self, spec: JobSpec, unpacked: Path | None) -> str:
+        """Add a job whose capture is in the folder `unpacked`, which is moved into the store. Returns the id.
+
+        None: its capture is one that another job uses. Raises `CaptureNotFound` where it is not there any more.
+        """
         now = time.time()
         job_id = f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
-        sync_tree(unpacked)  # after a power failure no job may be there without its images
+        if unpacked is not None:
+            sync_tree(unpacked)  # after a power failure no job may be there without its images
         with self._changing():
             capture = self._captures / spec.capture
-            if _files(capture) == _files(unpacked):
+            if unpacked is None:
+                if not capture.is_dir():
+                    raise CaptureNotFound(spec.capture)
+            elif _files(capture) == _files(unpacked):
                 shutil.rmtree(unpacked)
             else:
                 # A new capture, or one with missing files: replace it with the complete upload.

@@ -20,7 +20,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 
 from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError
-from jobs.job import JobConflict, JobDamaged, JobError, JobNotFound
+from jobs.job import CaptureNotFound, JobConflict, JobDamaged, JobError, JobNotFound
 
 LOG = logging.getLogger(__name__)
 
@@ -100,6 +100,7 @@ class NotAcceptable(ServiceError):
 # The first matching class counts.
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (JobNotFound, 404, "no-such-job"),
+    (CaptureNotFound, 404, "no-such-capture"),
     (JobConflict, 409, "state-conflict"),
     (JobDamaged, 500, "job-damaged"),
     (JobError, 503, "jobs-unavailable"),

@@ -35,7 +35,7 @@ MIN_MATCHES: Final = 40
 GOOD: Final = 0.5
 # Another convention is named if it explains this share of the matches, and this many times as many as the poses do.
 EXPLAINS: Final = 0.4
-TIMES_BETTER: Final = 2.0
+TIMES_BETTER: Final = 1.4
 
 
 class Consistency(Document):
