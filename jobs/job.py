@@ -56,6 +56,13 @@ class JobNotFound(JobError):
         super().__init__(f"There is no job {job_id!r}. The list of jobs has every id.")
 
 
+class CaptureNotFound(JobError):
+    """No job has such a capture."""
+
+    def __init__(self, digest: str) -> None:
+        super().__init__(f"There is no capture {digest!r}: a capture is kept while a job uses it. Send it again.")
+
+
 class JobDamaged(JobError):
     """A file of the job cannot be read."""
 

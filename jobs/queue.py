@@ -49,8 +49,11 @@ class JobQueue:
                     continue
                 self._engine.enqueue(job_id, priority)
 
-    def submit(self, spec: JobSpec, unpacked: Path, key: str | None = None) -> Job:
-        """A new job on the capture in the folder `unpacked`; with a `key` that was used before, the job of then."""
+    def submit(self, spec: JobSpec, unpacked: Path | None, key: str | None = None) -> Job:
+        """A new job on the capture in the folder `unpacked`, which is moved into the store; None: on one it has.
+
+        With a `key` that was used before, the job of then.
+        """
         job_id = self.store.create(spec, unpacked, key)
         try:
             self._engine.enqueue(job_id, spec.priority)

@@ -27,7 +27,17 @@ from pathlib import Path
 
 from graings.storage.files import sync_folder, sync_tree, write_json
 from graings.storage.run_folder import MODEL_FILE, PLAN_FILE, newest_checkpoint
-from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, OtherSubmission, check_id, is_id
+from jobs.job import (
+    Attempt,
+    CaptureNotFound,
+    JobConflict,
+    JobDamaged,
+    JobNotFound,
+    JobSpec,
+    OtherSubmission,
+    check_id,
+    is_id,
+)
 from jobs.locks import locked
 
 LOG = logging.getLogger(__name__)
@@ -158,15 +168,16 @@ class Store:
         """The folder with the files of a capture."""
         return capture_root(self._captures / digest)
 
-    def create(self, spec: JobSpec, unpacked: Path, key: str | None = None) -> str:
-        """Add a job whose capture is in the folder `unpacked`, which is moved into the store.
+    def create(self, spec: JobSpec, unpacked: Path | None, key: str | None = None) -> str:
+        """Add a job whose capture is in the folder `unpacked`, which is moved into the store; None: one it has.
 
         Returns its id; with a `key` that its owner has used, that of the job of then. Raises `OtherSubmission` if that
-        job was submitted differently.
+        job was submitted differently, and `CaptureNotFound` where the capture is not there any more.
         """
         now = time.time()
         job_id = f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
-        sync_tree(unpacked)  # after a power failure no job may be there without its images
+        if unpacked is not None:
+            sync_tree(unpacked)  # after a power failure no job may be there without its images
         submission = self._submissions / hashlib.sha256(f"{spec.owner} {key}".encode()).hexdigest()
         with self.changing():
             if key is not None and submission.exists():
@@ -174,7 +185,10 @@ class Store:
                     raise OtherSubmission("This Idempotency-Key was used with other content. Choose a new one.")
                 return submission.resolve().name
             capture = self._captures / spec.capture
-            if _files(capture) == _files(unpacked):
+            if unpacked is None:
+                if not capture.is_dir():
+                    raise CaptureNotFound(spec.capture)
+            elif _files(capture) == _files(unpacked):
                 shutil.rmtree(unpacked)
             else:
                 # A new capture, or one with missing files: replace it with the complete upload.

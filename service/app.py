@@ -18,7 +18,7 @@ from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
 from service.head import Head
-from service.routes import export, jobs, plans, render, results, sessions, system
+from service.routes import captures, export, jobs, plans, render, results, sessions, system
 from service.same_origin import SameOrigin
 from service.security_headers import SecurityHeaders
 from service.settings import Settings
@@ -44,7 +44,7 @@ def create_app(settings: Settings) -> FastAPI:
             await to_thread.run_sync(app.state.context.close)
 
     def limit(method: str, path: str) -> int:
-        uploads = method == "POST" and path in ("/jobs", "/plans")
+        uploads = method == "POST" and path in ("/jobs", "/plans", "/captures")
         return settings.max_upload_mb * MB if uploads else _SMALL_BODY
 
     app = FastAPI(
@@ -62,7 +62,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
     app.add_middleware(Head)
     app.add_middleware(SecurityHeaders)
-    for routes in (jobs, plans, results, export, render, sessions, system):
+    for routes in (captures, jobs, plans, results, export, render, sessions, system):
         app.include_router(routes.router, dependencies=[Depends(authorize)])
     for routes in (sessions, system):
         app.include_router(routes.open_router)

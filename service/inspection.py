@@ -16,6 +16,8 @@ from graings.capture.load import load_capture
 from graings.config import CaptureConfig, TrainConfig
 from graings.errors import CaptureError
 from graings.footage.source import find_footage
+from graings.inspection import inspect as inspection
+from graings.inspection.document import Inspection
 from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan
 from graings.plan.survey import survey
@@ -34,6 +36,12 @@ async def plan_capture(folder: Path, config: TrainConfig) -> Plan:
     """The plan of training with `config` on the unpacked capture. Raises `CaptureError` as `inspect_capture` does."""
     planned = await _apart(_make_plan, folder, config)
     return Plan.model_validate_json(planned)
+
+
+async def describe_capture(folder: Path, config: CaptureConfig) -> Inspection:
+    """The inspection of the unpacked capture. Raises `CaptureError` as `inspect_capture` does."""
+    described = await _apart(_describe, folder, config)
+    return Inspection.model_validate_json(described)
 
 
 async def _apart(look: Callable[[Path, Options], _Defect | str | None], folder: Path, options: Options) -> str:
@@ -72,6 +80,18 @@ def _make_plan(folder: Path, config: TrainConfig) -> _Defect | str:
         return "a plan needs the cameras, which are not known yet", footage.name, None, remedy
     try:
         return survey(root, config, stored_calibration()).model_dump_json(by_alias=True)
+    except CaptureError as error:
+        return _defect(root, error)
+
+
+def _describe(folder: Path, config: CaptureConfig) -> _Defect | str:
+    """The inspection as JSON."""
+    root = capture_root(folder)
+    if (footage := find_footage(root)) is not None:
+        remedy = "Submit it as a job, or make a capture of it first: graings capture."
+        return "an inspection needs the cameras, which are not known yet", footage.name, None, remedy
+    try:
+        return inspection.inspect_capture(root, config, stored_calibration())[0].model_dump_json(by_alias=True)
     except CaptureError as error:
         return _defect(root, error)
 

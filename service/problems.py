@@ -21,7 +21,7 @@ from starlette.responses import Response
 from starlette.routing import Match, Mount
 
 from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError
-from jobs.job import JobConflict, JobDamaged, JobError, JobNotFound, OtherSubmission
+from jobs.job import CaptureNotFound, JobConflict, JobDamaged, JobError, JobNotFound, OtherSubmission
 
 LOG = logging.getLogger(__name__)
 
@@ -107,6 +107,7 @@ class NotAcceptable(ServiceError):
 # The first matching class counts.
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (JobNotFound, 404, "no-such-job"),
+    (CaptureNotFound, 404, "no-such-capture"),
     (JobConflict, 409, "state-conflict"),
     (JobDamaged, 500, "job-damaged"),
     (OtherSubmission, 422, "idempotency-key-reused"),

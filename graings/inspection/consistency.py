@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from graings.camera.camera import Camera
+from graings.camera.units import Units
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.document import Document
@@ -34,7 +35,7 @@ MIN_MATCHES: Final = 40
 GOOD: Final = 0.5
 # Another convention is named if it explains this share of the matches, and this many times as many as the poses do.
 EXPLAINS: Final = 0.4
-TIMES_BETTER: Final = 2.0
+TIMES_BETTER: Final = 1.4
 
 
 class Consistency(Document):
@@ -76,11 +77,17 @@ class Convention:
             pose[:3, 3] = -pose[:3, :3] @ center
         else:
             pose[:3] = self.axes @ pose[:3]
-        return Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        return _with_pose(camera, pose)
 
 
-def consistency(frames: Sequence[Frame], images: ImageStore, *, opengl: bool) -> Consistency:
+def _with_pose(camera: Camera, pose: Array) -> Camera:
+    return Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+
+
+def consistency(frames: Sequence[Frame], images: ImageStore, units: Units, *, opengl: bool) -> Consistency:
     """Test the poses of `frames`, in the capture's order; `opengl` says that its format has OpenGL's camera axes.
+
+    `units` are those of the capture: a mistake is one of the poses as its files have them.
 
     Masked pixels are not used. Raises `CaptureError` where an image cannot be read.
     """
@@ -104,9 +111,10 @@ def consistency(frames: Sequence[Frame], images: ImageStore, *, opengl: bool) ->
     if share >= GOOD:
         return Consistency(images=len(chosen), matches=total, share=share)
     as_read = np.diag([1.0, -1.0, -1.0]) if opengl else np.eye(3)
+    raw = [_with_pose(camera, units.camera_back(camera)) for camera in cameras]
     best, most = None, max(EXPLAINS, TIMES_BETTER * share)
     for convention in _conventions(opengl=opengl):
-        explained = _share([convention.applied(camera, as_read) for camera in cameras], found)
+        explained = _share([convention.applied(camera, as_read) for camera in raw], found)
         if explained > most:
             best, most = convention, explained
     return Consistency(

@@ -44,7 +44,7 @@ def inspect_capture(
     background = seen.background_rgb()
     images = ImageStore(background, seen.cache_mb)
     statistics = measure(capture, images, background)
-    tested = consistency(in_order(capture.train), images, opengl=capture.kind == "transforms")
+    tested = consistency(in_order(capture.train), images, capture.units, opengl=capture.kind == "transforms")
     low, high = bounds(capture)
     units, distances = capture.units, _distances(capture)
     first = capture.train[0]

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
+from graings.camera.units import Units
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
@@ -21,6 +22,7 @@ from tests.capture.captures import write_walled
 
 Matrix = NDArray[np.float64]
 WHITE = (1.0, 1.0, 1.0)
+UNITS = Units((0.3, -2.0, 1.0), scale=0.5, time_start=0.0, time_span=1.0, up=(0.0, 0.0, 1.0))
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -42,15 +44,15 @@ def wrong(frames: tuple[Frame, ...], change: Callable[[Matrix], Matrix]) -> list
     found = []
     for frame in frames:
         camera = frame.camera
-        matrix = change(np.linalg.inv(camera.world_to_camera) @ FLIP)
-        pose = np.linalg.inv(matrix @ FLIP)
+        matrix = change(np.linalg.inv(UNITS.camera_back(camera)) @ FLIP)
+        pose = UNITS.camera(np.linalg.inv(matrix @ FLIP))
         size = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         found.append(replace(frame, camera=Camera(pose, *size)))
     return found
 
 
 def judged(frames: tuple[Frame, ...] | list[Frame]) -> Consistency:
-    return consistency(frames, ImageStore(WHITE), opengl=True)
+    return consistency(frames, ImageStore(WHITE), UNITS, opengl=True)
 
 
 def test_right_poses_explain_the_matches(frames: tuple[Frame, ...]) -> None:
@@ -116,7 +118,7 @@ def test_pictures_without_features_are_not_judged(frames: tuple[Frame, ...], tmp
         def rgb(self, frame: Frame) -> NDArray[np.float32]:
             return np.ones((frame.camera.height, frame.camera.width, 3), np.float32)
 
-    found = consistency(flat, Blank(WHITE), opengl=True)
+    found = consistency(flat, Blank(WHITE), UNITS, opengl=True)
     assert (found.share, found.other) == (None, None)
     assert found.matches < MIN_MATCHES
     assert "features match" in str(found.reason)
