@@ -29,6 +29,7 @@ _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _FORM = {
     "type": "object",
     "required": ["capture"],
+    "additionalProperties": False,
     "properties": {
         "capture": {"type": "string", "format": "binary", "description": "A zip, tar or tar.gz of the capture."},
         "config": {"type": "string", "description": "Options as a JSON object, which override those of the query."},
