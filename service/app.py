@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 from anyio import to_thread
 from fastapi import Depends, FastAPI
@@ -30,6 +31,15 @@ _SMALL_BODY = 64 * 1024
 SWITCH_S = 0.001
 
 
+class Service(FastAPI):
+    """The application, with the schemas of its errors in its description."""
+
+    def openapi(self) -> dict[str, Any]:
+        document = super().openapi()
+        document["components"]["schemas"].update(problems.SCHEMAS)
+        return document
+
+
 def create_app(settings: Settings) -> FastAPI:
     """The service as an ASGI application; it opens its data folder when it starts."""
 
@@ -47,7 +57,7 @@ def create_app(settings: Settings) -> FastAPI:
         uploads = method == "POST" and path in ("/jobs", "/plans", "/captures")
         return settings.max_upload_mb * MB if uploads else _SMALL_BODY
 
-    app = FastAPI(
+    app = Service(
         title="GrainGS",
         version=graings.__version__,
         summary="See a moving scene from anywhere, at any time, with nothing but a CPU.",

@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from types import MappingProxyType
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, Field
+from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
@@ -29,6 +30,14 @@ MEDIA_TYPE = "application/problem+json"
 _TYPES = "urn:graings:problem:"
 
 
+class WrongParameter(BaseModel):
+    """A parameter that was refused."""
+
+    loc: list[str | int] = Field(description="Where it is.")
+    msg: str = Field(description="What is wrong with it.")
+    type: str = Field(description="Names the kind of error.")
+
+
 class Problem(BaseModel):
     """A problem document; `type` is about:blank if there is no more specific type than the status."""
 
@@ -37,7 +46,7 @@ class Problem(BaseModel):
     status: int
     detail: str | None = None
     instance: str | None = None
-    errors: list[dict[str, Any]] | None = Field(None, description="The wrong parameters and what is wrong with each.")
+    errors: list[WrongParameter] = Field([], description="The wrong parameters and what is wrong with each.")
 
 
 class ServiceError(Exception):
@@ -137,16 +146,15 @@ _DETAILS = {
     405: "This address does not accept the method; the header Allow lists the methods that it accepts.",
 }
 
+_CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {
-        "description": "An error in the request",
-        "content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}},
-    },
-    "5XX": {
-        "description": "An error in the service",
-        "content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}},
-    },
+    "4XX": {"description": "An error in the request", "content": _CONTENT},
+    "5XX": {"description": "An error in the service", "content": _CONTENT},
 }
+# The schemas that this refers to: the framework knows only those of answers without an error.
+SCHEMAS: dict[str, Any] = models_json_schema([(Problem, "serialization")], ref_template="#/components/schemas/{model}")[
+    1
+]["$defs"]
 
 
 def problem(
@@ -155,7 +163,7 @@ def problem(
     detail: str | None = None,
     *,
     kind: str | None = None,
-    errors: list[dict[str, Any]] | None = None,
+    errors: Sequence[WrongParameter] = (),
     headers: Mapping[str, str] | None = None,
 ) -> Response:
     """A problem document as a response."""
@@ -165,9 +173,10 @@ def problem(
         status=status,
         detail=detail,
         instance=request.url.path,
-        errors=errors,
+        errors=list(errors),
     )
-    text = json.dumps(document.model_dump(exclude_none=True), ensure_ascii=False, allow_nan=False)
+    values = document.model_dump(exclude_none=True, exclude=None if errors else {"errors"})
+    text = json.dumps(values, ensure_ascii=False, allow_nan=False)
     # A request may contain half of a surrogate pair, as "\\ud800" in JSON, which UTF-8 cannot encode.
     return Response(text.encode("utf-8", "replace"), status, media_type=MEDIA_TYPE, headers=headers)
 
@@ -194,7 +203,7 @@ def install(app: FastAPI) -> None:
     async def validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
         # Without the offending input: it may be large, secret or NaN.
-        errors = [{"loc": list(e["loc"]), "msg": e["msg"], "type": e["type"]} for e in error.errors()]
+        errors = [WrongParameter(loc=e["loc"], msg=e["msg"], type=e["type"]) for e in error.errors()]
         detail = "; ".join(f"{'.'.join(str(part) for part in e['loc'][1:])}: {e['msg']}" for e in error.errors())
         return problem(request, 422, detail, kind="bad-parameter", errors=errors)
 

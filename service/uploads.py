@@ -30,6 +30,7 @@ _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _FORM = {
     "type": "object",
     "required": ["capture"],
+    "additionalProperties": False,
     "properties": {
         "capture": {
             "type": "string",
