@@ -29,6 +29,8 @@ NEEDS: Final[dict[str, Scope]] = {
     "list_jobs": Scope.VIEW,
     "get_events": Scope.VIEW,
     "render": Scope.VIEW,
+    "get_scene": Scope.VIEW,
+    "get_views": Scope.VIEW,
 }
 
 _bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key that `graings keys create` has shown.")

@@ -13,13 +13,14 @@ from fastapi.staticfiles import StaticFiles
 
 import graings
 from graings.kernel import use_threads
+from graings.player import WEB as PLAYER
 from service import problems
 from service.access import authorize
 from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
 from service.head import Head
-from service.routes import captures, export, jobs, plans, render, results, sessions, system
+from service.routes import captures, export, jobs, plans, render, results, scenes, sessions, system
 from service.same_origin import SameOrigin
 from service.security_headers import SecurityHeaders
 from service.settings import Settings
@@ -72,10 +73,11 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
     app.add_middleware(Head)
     app.add_middleware(SecurityHeaders)
-    for routes in (captures, jobs, plans, results, export, render, sessions, system):
+    for routes in (captures, jobs, plans, results, export, render, scenes, sessions, system):
         app.include_router(routes.router, dependencies=[Depends(authorize)])
     for routes in (sessions, system):
         app.include_router(routes.open_router)
     app.mount("/web/swagger", StaticFiles(packages=[("fastapi_swagger", "resources")]), name="swagger")
+    app.mount("/web/player", StaticFiles(directory=PLAYER), name="player")
     app.mount("/web", StaticFiles(directory=system.WEB), name="web")
     return app

@@ -16,6 +16,7 @@ from service.archives import Limits
 from service.keys import Keys
 from service.rendering import ModelCache, RenderPool
 from service.request_limits import RequestLimits
+from service.scenes import SceneFiles
 from service.settings import Settings
 
 MB = 1_000_000
@@ -32,6 +33,7 @@ class Context:
     leases: Leases
     models: ModelCache
     pool: RenderPool
+    scenes: SceneFiles
     keys: Keys
     request_limits: RequestLimits
 
@@ -70,6 +72,7 @@ def open_context(settings: Settings) -> Context:
         leases=open_leases(settings.database_url, store.workers),
         models=ModelCache(settings.models_mb * MB),
         pool=RenderPool(settings.images_at_once, settings.images_mb * MB),
+        scenes=SceneFiles(),
         keys=Keys(store.root / "keys"),
         request_limits=RequestLimits(settings.key_requests, settings.key_open_requests),
     )

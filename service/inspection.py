@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from anyio import BrokenWorkerProcess, to_process
 
@@ -23,31 +23,40 @@ from graings.plan.plan import Plan
 from graings.plan.survey import survey
 from jobs.store import capture_root
 
-_Defect = tuple[str, str, str | None, str]  # problem, file, field, remedy
-Options = TypeVar("Options", CaptureConfig, TrainConfig)
+
+class Defect(NamedTuple):
+    """A `CaptureError` as it travels between processes: pickle cannot restore its keyword arguments."""
+
+    problem: str
+    file: str
+    field: str | None
+    remedy: str
+
+
+Found = TypeVar("Found")
 
 
 async def inspect_capture(folder: Path, config: CaptureConfig) -> None:
     """Raise `CaptureError` if training cannot start on the unpacked capture; it names files by their path in it."""
-    await _apart(_find_defect, folder, config)
+    await apart(_find_defect, folder, config)
 
 
 async def plan_capture(folder: Path, config: TrainConfig) -> Plan:
     """The plan of training with `config` on the unpacked capture. Raises `CaptureError` as `inspect_capture` does."""
-    planned = await _apart(_make_plan, folder, config)
+    planned = await apart(_make_plan, folder, config)
     return Plan.model_validate_json(planned)
 
 
 async def describe_capture(folder: Path, config: CaptureConfig) -> Inspection:
     """The inspection of the unpacked capture. Raises `CaptureError` as `inspect_capture` does."""
-    described = await _apart(_describe, folder, config)
+    described = await apart(_describe, folder, config)
     return Inspection.model_validate_json(described)
 
 
-async def _apart(look: Callable[[Path, Options], _Defect | str | None], folder: Path, options: Options) -> str:
+async def apart(look: Callable[..., Found | Defect], *arguments: object) -> Found:
     """What `look` finds in another process. Raises `CaptureError` for a defect."""
     try:
-        found = await to_process.run_sync(look, folder, options, cancellable=True)
+        found = await to_process.run_sync(look, *arguments, cancellable=True)
     except BrokenWorkerProcess as error:
         raise CaptureError(
             "reading it ended the reading process",
@@ -55,51 +64,53 @@ async def _apart(look: Callable[[Path, Options], _Defect | str | None], folder: 
             remedy="Open its images, and its COLMAP model if it has one, in the programs that wrote them, and save"
             " again the files that cannot be read.",
         ) from error
-    if isinstance(found, tuple):
-        problem, file, field, remedy = found
-        raise CaptureError(problem, file=file, field=field, remedy=remedy)
-    return found or ""
+    if isinstance(found, Defect):
+        raise CaptureError(found.problem, file=found.file, field=found.field, remedy=found.remedy)
+    return found
 
 
-def _find_defect(folder: Path, config: CaptureConfig) -> _Defect | None:
+def _find_defect(folder: Path, config: CaptureConfig) -> Defect | None:
     root = capture_root(folder)
     if find_footage(root) is not None:
         return None  # the job finds its cameras first, and says there what is wrong
     try:
         load_capture(root, config)
     except CaptureError as error:
-        return _defect(root, error)
+        return defect(root, error)
     return None
 
 
-def _make_plan(folder: Path, config: TrainConfig) -> _Defect | str:
+def _make_plan(folder: Path, config: TrainConfig) -> Defect | str:
     """The plan as JSON. The service measures no times itself: it uses the calibration of an earlier training."""
     root = capture_root(folder)
     if (footage := find_footage(root)) is not None:
-        remedy = "Submit it as a job, or make a capture of it first: graings capture."
-        return "a plan needs the cameras, which are not known yet", footage.name, None, remedy
+        return _without_cameras("a plan", footage)
     try:
         return survey(root, config, stored_calibration()).model_dump_json(by_alias=True)
     except CaptureError as error:
-        return _defect(root, error)
+        return defect(root, error)
 
 
-def _describe(folder: Path, config: CaptureConfig) -> _Defect | str:
+def _describe(folder: Path, config: CaptureConfig) -> Defect | str:
     """The inspection as JSON."""
     root = capture_root(folder)
     if (footage := find_footage(root)) is not None:
-        remedy = "Submit it as a job, or make a capture of it first: graings capture."
-        return "an inspection needs the cameras, which are not known yet", footage.name, None, remedy
+        return _without_cameras("an inspection", footage)
     try:
         return inspection.inspect_capture(root, config, stored_calibration())[0].model_dump_json(by_alias=True)
     except CaptureError as error:
-        return _defect(root, error)
+        return defect(root, error)
 
 
-def _defect(root: Path, error: CaptureError) -> _Defect:
-    """The error as a tuple, because pickle cannot restore its keyword arguments; files by their path in the archive."""
+def _without_cameras(what: str, footage: Path) -> Defect:
+    remedy = "Submit it as a job, or make a capture of it first: graings capture."
+    return Defect(f"{what} needs the cameras, which are not known yet", footage.name, None, remedy)
+
+
+def defect(root: Path, error: CaptureError) -> Defect:
+    """The error, with files by their path in the archive."""
 
     def relative(text: str) -> str:
         return text.replace(f"{root}/", "").replace(str(root), "the archive")
 
-    return relative(error.problem), relative(error.file), error.field, relative(error.remedy)
+    return Defect(relative(error.problem), relative(error.file), error.field, relative(error.remedy))

@@ -93,6 +93,9 @@ def job_summary(job: Job) -> JobSummary:
         links["retry"] = f"{base}/retry"
     if job.checkpoint is not None or job.has_model:
         links |= {"render": f"/render?job={job.id}", "export": f"{base}/export?format=ply"}
+        links["views"] = f"{base}/views"
+        links["scene"] = f"{base}/scene" + ("" if job.checkpoint is None else f"?checkpoint={job.checkpoint}")
+        links["comparison"] = f"{base}/comparison"
     if job.has_plan:
         links["plan"] = f"{base}/plan"
     if job.has_metrics:

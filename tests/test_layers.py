@@ -42,6 +42,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.evaluation": ("graings.capture", "graings.render", "graings.scene"),
     "graings.storage": ("graings.camera", "graings.config", "graings.scene"),
     "graings.export": ("graings.camera", "graings.raster", "graings.render", "graings.scene", "graings.storage"),
+    "graings.player": ("graings.camera", "graings.export", "graings.render", "graings.scene", "graings.storage"),
     "graings.report": (
         *(
             "graings.camera",
@@ -69,7 +70,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
         *("graings.export", "graings.footage", "graings.inspection", "graings.kernel", "graings.plan"),
-        *("graings.render", "graings.report", "graings.storage", "graings.training"),
+        *("graings.player", "graings.render", "graings.report", "graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
     "jobs": (
@@ -82,8 +83,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "client": (),
     # HTTP never trains.
     "service": (
-        *("graings.camera", "graings.capture", "graings.config", "graings.export", "graings.footage.source"),
-        *("graings.kernel", "graings.plan", "graings.render", "graings.report", "graings.storage", "jobs"),
+        *("graings.camera", "graings.capture", "graings.config", "graings.evaluation", "graings.export"),
+        *("graings.footage.source", "graings.inspection", "graings.kernel", "graings.plan", "graings.player"),
+        *("graings.render", "graings.report", "graings.storage", "jobs"),
     ),
 }
 

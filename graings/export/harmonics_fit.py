@@ -118,3 +118,18 @@ def _least_squares(
             fits[place].append(found)
     mean_squares = squares / (3 * weights.sum(dtype=torch.float64))
     return [torch.cat(parts) for parts in fits], mean_squares.sqrt().tolist()
+
+
+def fit_colors(
+    means: Float[Tensor, "gaussian 3"],
+    eyes: Float[Tensor, "view 3"],
+    colors: Float[Tensor, "view gaussian 3"],
+    weights: Float[Tensor, "view gaussian"],
+) -> tuple[Float[Tensor, "gaussian harmonic 3"], float]:
+    """Harmonics of `colors` seen from `eyes`, of the lowest degree that suffices, and their root mean square error.
+
+    `weights` are contributions in px: how much each colour counts.
+    """
+    fits, errors = _least_squares(means.double(), eyes.double(), colors, weights + _FLOOR, MAX_DEGREE)
+    degree = next(d for d in range(MAX_DEGREE + 1) if errors[d] <= errors[MAX_DEGREE] + _NEGLIGIBLE)
+    return fits[degree].float(), errors[degree]

@@ -27,6 +27,7 @@ from graings.storage.model import Model
 from jobs.job import JobNotFound
 from service.access import Caller, CallerDep
 from service.context import Context, ContextDep
+from service.etags import matches
 from service.problems import RESPONSES, BadRequest, NotAcceptable, NotYet
 from service.rendering import LoadedModel, RenderRequest
 
@@ -142,7 +143,7 @@ async def render(
         headers["X-Time-Clamped"] = f"{time:g}"
     if view.is_orbit:
         headers["X-Graings-Orbit"] = _orbit_header(view, camera, model.units)
-    if _matches(if_none_match, headers["ETag"]):
+    if matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     resolved = perf_counter()
     image = await context.pool.render(loaded, request, headers["ETag"])
@@ -250,8 +251,3 @@ def _etag(model: Model, request: RenderRequest) -> str:
         (request.time, request.background, request.format, request.content, request.fast),
     )
     return f'"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}"'
-
-
-def _matches(if_none_match: str | None, etag: str) -> bool:
-    known = [tag.strip().removeprefix("W/") for tag in (if_none_match or "").split(",")]
-    return etag in known or "*" in known

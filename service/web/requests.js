@@ -1,0 +1,22 @@
+// Requests to the service, and what the session of this browser may do.
+
+export async function request(path, options) {
+  const response = await fetch(path, options);
+  if (response.status === 204) return null;
+  const body = await response.json();
+  if (!response.ok) throw new Error(body.detail || body.title || response.statusText);
+  return body;
+}
+
+const SCOPES = ["view", "read", "train", "admin"];
+
+export const session = { scope: "admin", name: null };
+
+export const may = (scope) => SCOPES.indexOf(session.scope) >= SCOPES.indexOf(scope);
+
+export async function signIn(secret) {
+  await request("/session", { method: "POST", headers: { Authorization: `Bearer ${secret}` } });
+  location.replace("/");
+}
+
+export const signOut = () => request("/session", { method: "DELETE" }).then(() => location.replace("/"));
