@@ -48,6 +48,10 @@ def worker(
             envvar="GRAINGS_NICE", min=0, max=19, help="Lower the priority of trainings on the CPU by so much."
         ),
     ] = TRAINING_NICE,
+    private_webhooks: Annotated[
+        bool,
+        typer.Option(envvar="GRAINGS_PRIVATE_WEBHOOKS", help="Let webhooks be addresses inside this network."),
+    ] = False,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="Stop when standard input ends.")
     ] = False,
@@ -65,7 +69,7 @@ def worker(
     job_threads = threads or max(1, cores // slots)
     try:
         url = database or default_database(store.root)
-        Worker(store, url, slots=slots, threads=job_threads, nice=nice).run(stop)
+        Worker(store, url, slots=slots, threads=job_threads, nice=nice, private_webhooks=private_webhooks).run(stop)
     except JobError as error:
         typer.echo(f"worker: {error}", err=True)
         raise typer.Exit(1) from error

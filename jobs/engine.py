@@ -24,11 +24,13 @@ from jobs.job import JobConflict, JobState, Outcome
 
 QUEUE = "train"
 WORKFLOW = "train"
+MESSAGES = "messages"  # the queue and the workflow of webhooks
 APPLICATION = "graings"
 # The version of the workflow's steps, not of the program: DBOS gives an interrupted job only to workers of the same
 # version. Increase it only when the steps change.
 VERSION = "jobs-1"
 POLL_S = 0.5
+MESSAGES_AT_ONCE = 4
 
 # What a query raises when the database does not answer.
 _CONNECTION_ERRORS = (
@@ -96,6 +98,18 @@ class Engine:
         with self._connection_errors():
             self._client.enqueue(options, job_id)
 
+    def send(self, message_id: str, job_id: str, content: dict[str, Any], attempt: int = 0, delay_s: float = 0) -> None:
+        """Have a worker deliver a message to the webhook of a job; one that is already there is not sent twice."""
+        options: EnqueueOptions = {
+            "workflow_name": MESSAGES,
+            "queue_name": MESSAGES,
+            "workflow_id": f"{message_id}.{attempt}",
+        }
+        if delay_s:
+            options["delay_seconds"] = delay_s
+        with self._connection_errors():
+            self._client.enqueue(options, message_id, job_id, content, attempt)
+
     def entries(self, job_ids: Sequence[str]) -> dict[str, QueueEntry]:
         """The entries of these jobs by id, without those that are not in the queue."""
         if not job_ids:
@@ -112,9 +126,20 @@ class Engine:
         """How many jobs wait for a worker."""
         return len(self._in_state("ENQUEUED"))
 
-    def _in_state(self, status: str) -> list[WorkflowStatus]:
+    def delivering(self) -> dict[str, str | None]:
+        """The worker of each message that is being delivered, also those of workers that died."""
+        return {status.workflow_id: status.executor_id for status in self._in_state("PENDING", MESSAGES)}
+
+    def requeue_messages(self, executor: str) -> None:
+        """Put the messages back in the queue that a worker was delivering when it died."""
+        stranded = [message for message, worker in self.delivering().items() if worker == executor]
+        if stranded:
+            with self._connection_errors():
+                self._client.resume_workflows(stranded, queue_name=MESSAGES)
+
+    def _in_state(self, status: str, name: str = WORKFLOW) -> list[WorkflowStatus]:
         with self._connection_errors():
-            return self._client.list_workflows(status=status, name=WORKFLOW, load_input=False, load_output=False)
+            return self._client.list_workflows(status=status, name=name, load_input=False, load_output=False)
 
     def cancel(self, job_id: str) -> None:
         """Take a job out of the queue; its worker, if any, stops within two seconds."""
@@ -152,18 +177,27 @@ class Engine:
             ) from error
 
     def delete(self, job_id: str) -> None:
-        """Remove the entry of a job."""
+        """Remove the entry of a job, and its messages."""
         with self._connection_errors():
-            self._client.delete_workflow(job_id)
+            messages = self._client.list_workflows(workflow_id_prefix=f"{job_id}.", load_input=False, load_output=False)
+            self._client.delete_workflows([job_id, *(message.workflow_id for message in messages)])
 
     def close(self) -> None:
         self._client.destroy()
 
 
 @contextmanager
-def executing(url: str, executor: str, slots: int, run: Callable[[str], Awaitable[Outcome]]) -> Iterator[None]:
+def executing(
+    url: str,
+    executor: str,
+    slots: int,
+    run: Callable[[str], Awaitable[Outcome]],
+    deliver: Callable[[str, str, dict[str, Any], int], None],
+) -> Iterator[None]:
     """Take jobs from the queue while the context lasts, `slots` at a time, and await `run(job_id)` for each.
 
+
+    `deliver` sends one message (id, job, content, attempt).
     `run` is cancelled within two seconds after its job is cancelled or the context ends; it then has ten seconds. Enter
     it only once per process. `slots` is a property of the queue: the last worker to start sets it for all workers.
     """
@@ -189,10 +223,15 @@ def executing(url: str, executor: str, slots: int, run: Callable[[str], Awaitabl
     async def workflow(job_id: str) -> dict[str, Any]:
         return await step(job_id)
 
-    DBOS.listen_queues([QUEUE])
+    @DBOS.workflow(name=MESSAGES)
+    def messages(message_id: str, job_id: str, content: dict[str, Any], attempt: int) -> None:
+        DBOS.run_step({"name": "deliver"}, deliver, message_id, job_id, content, attempt)
+
+    DBOS.listen_queues([QUEUE, MESSAGES])
     DBOS.launch()
     try:
         DBOS.register_queue(QUEUE, worker_concurrency=slots, polling_interval_sec=POLL_S, on_conflict="always_update")
+        DBOS.register_queue(MESSAGES, worker_concurrency=MESSAGES_AT_ONCE, polling_interval_sec=POLL_S)
         yield
     finally:
         DBOS.destroy(destroy_registry=True)

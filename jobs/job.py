@@ -19,7 +19,7 @@ The last checkpoint is always kept, and a job that is queued again continues fro
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -56,6 +56,13 @@ class JobNotFound(JobError):
         super().__init__(f"There is no job {job_id!r}. The list of jobs has every id.")
 
 
+class CaptureNotFound(JobError):
+    """No job has such a capture."""
+
+    def __init__(self, digest: str) -> None:
+        super().__init__(f"There is no capture {digest!r}: a capture is kept while a job uses it. Send it again.")
+
+
 class JobDamaged(JobError):
     """A file of the job cannot be read."""
 
@@ -64,11 +71,16 @@ class JobConflict(JobError):
     """The job's state does not allow the request."""
 
 
+class OtherSubmission(JobError):
+    """The key of a submission was used for another one."""
+
+
 @dataclass(frozen=True, slots=True)
 class JobSpec:
     """A submitted job. `capture` is the SHA-256 of the uploaded archive, `config` a whole `TrainConfig` as JSON.
 
     Jobs with a lower `priority` start first. `owner` is the key that submitted it; None for nobody's.
+    `webhook` is the address that is told what happens to it, with a secret to sign that.
     """
 
     name: str
@@ -76,6 +88,12 @@ class JobSpec:
     config: dict[str, Any]
     priority: int = 10
     owner: str | None = None
+    webhook: str | None = None
+    webhook_secret: str | None = None
+
+    def extended(self, iterations: int) -> JobSpec:
+        """The same with so many more iterations."""
+        return replace(self, config={**self.config, "iterations": self.config["iterations"] + iterations})
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,12 @@ Number = Annotated[float | None, BeforeValidator(_finite)]
 class ProgressReport(Document):
     """One report of the trainer. Numbers are null where there is no step yet or where they are not finite."""
 
-    phase: Literal["loading", "warmup", "joint", "static", "diverged"] = Field(description="What the trainer does.")
+    phase: Literal["capture", "loading", "warmup", "joint", "static", "diverged"] = Field(
+        description="What the job does; `capture` makes one of a video or of photographs."
+    )
+    step: str | None = Field(None, description="Part of the phase `capture`: frames, features, matching, mapping, ...")
+    step_done: int | None = Field(None, ge=0, description="How much of this part is done.")
+    step_total: int | None = Field(None, ge=0, description="Its whole.")
     iteration: int = Field(ge=0, description="Iterations done.")
     iterations: int = Field(
         ge=0, description="Iterations of the whole run. They grow when training is restarted (event `restart`)."
@@ -43,6 +48,9 @@ class ProgressReport(Document):
     iterations_per_s: Number = Field(None, description="Iterations per second over the last few seconds.")
     eta_s: Number = Field(None, description="Seconds of training left at this rate.")
     train_s: Number = Field(None, description="Seconds of training so far, evaluations not counted.")
+    phase_s: dict[str, float] = Field(
+        default_factory=dict, description="Seconds spent in each phase so far, by all attempts, evaluations included."
+    )
     held_out_psnr: Number = Field(None, description="PSNR of the last evaluation of this attempt, in dB.")
     held_out_ssim_3dgs: Number = Field(None, description="SSIM of the last evaluation of this attempt.")
     events: tuple[Event, ...] = Field((), description="What happened in the last step, beside an ordinary step.")

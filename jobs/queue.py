@@ -9,14 +9,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection
 from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Final
+from time import time
+from typing import Any, Final
 
 from jobs.engine import Engine, QueueEntry
 from jobs.job import Attempt, Job, JobConflict, JobDamaged, JobNotFound, JobSpec, JobState
 from jobs.progress import last_progress
 from jobs.store import Store
+from jobs.webhooks import message
 
 LOG = logging.getLogger(__name__)
 
@@ -46,14 +49,18 @@ class JobQueue:
                     continue
                 self._engine.enqueue(job_id, priority)
 
-    def submit(self, spec: JobSpec, unpacked: Path) -> Job:
-        """A new job on the capture in the folder `unpacked`, which is moved into the store."""
-        job_id = self.store.create(spec, unpacked)
+    def submit(self, spec: JobSpec, unpacked: Path | None, key: str | None = None) -> Job:
+        """A new job on the capture in the folder `unpacked`, which is moved into the store; None: on one it has.
+
+        With a `key` that was used before, the job of then.
+        """
+        job_id = self.store.create(spec, unpacked, key)
         try:
             self._engine.enqueue(job_id, spec.priority)
         except BaseException:
-            # The client gets an error and will submit it again.
-            self.store.delete(job_id)
+            # The client gets an error and will submit it again; with a key, that only enqueues it.
+            if key is None:
+                self.store.delete(job_id)
             raise
         return self.get(job_id)
 
@@ -100,6 +107,7 @@ class JobQueue:
             raise JobConflict(f"Job {job_id} has {job.state}; there is nothing to cancel.")
         if not job.state.final:
             self._engine.cancel(job_id)
+            self.tell(job_id, "ended", int(time()))
         return self.get(job_id)
 
     def resume(self, job_id: str) -> Job:
@@ -131,6 +139,25 @@ class JobQueue:
         elif job.state is JobState.SUCCEEDED:
             raise JobConflict(f"Job {job_id} has succeeded; there is nothing to retry. Submit a new job.")
         return self.get(job_id)
+
+    def extend(self, job_id: str, iterations: int) -> Job:
+        """Enqueue a job that has succeeded again, to train for so many more iterations."""
+        with self.store.changing():  # of two requests at once, one finds the job in the queue
+            job = self.get(job_id)
+            if job.state is not JobState.SUCCEEDED:
+                raise JobConflict(f"Job {job_id} is {job.state}; only one that has succeeded can be extended.")
+            self.store.folder(job_id).write_spec(job.spec.extended(iterations))
+            self._engine.rewind(job_id)
+        return self.get(job_id)
+
+    def tell(self, job_id: str, event: str, number: int = 0, **changes: Any) -> None:
+        """Send the webhook of a job, if it has one, that something happened; a `number` tells equal events apart.
+
+        `changes` are the fields of the job that the queue does not know yet.
+        """
+        job = replace(self.get(job_id), **changes)
+        if job.spec.webhook is not None:
+            self._engine.send(f"{job_id}.{event}.{number}", job_id, message(job, event))
 
     def delete(self, job_id: str) -> None:
         """Remove a job and all its files. Raises `JobConflict` while it runs."""

@@ -2,6 +2,7 @@
 
     <root>/captures/<sha256>/    an unpacked capture, shared by all jobs that use it
     <root>/jobs/<id>/            job.json, attempts.json, progress.jsonl, log.txt, lock, run/ (the folder of the run)
+    <root>/submissions/          the job of each idempotency key, as a link
     <root>/uploads/              archives that are being uploaded or unpacked
     <root>/workers/              leases of workers on this machine
 
@@ -10,12 +11,14 @@ Every file is replaced atomically. The state of a job is not here but in the que
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
 import shutil
 import time
 import uuid
+from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -24,7 +27,17 @@ from pathlib import Path
 
 from graings.storage.files import sync_folder, sync_tree, write_json
 from graings.storage.run_folder import MODEL_FILE, PLAN_FILE, newest_checkpoint
-from jobs.job import Attempt, JobConflict, JobDamaged, JobNotFound, JobSpec, check_id, is_id
+from jobs.job import (
+    Attempt,
+    CaptureNotFound,
+    JobConflict,
+    JobDamaged,
+    JobNotFound,
+    JobSpec,
+    OtherSubmission,
+    check_id,
+    is_id,
+)
 from jobs.locks import locked
 
 LOG = logging.getLogger(__name__)
@@ -43,6 +56,11 @@ class JobFolder:
     @property
     def run(self) -> Path:
         return self.path / "run"
+
+    @property
+    def capture(self) -> Path:
+        """The capture that was made of a video or of photographs."""
+        return self.path / "capture"
 
     @property
     def log(self) -> Path:
@@ -87,6 +105,11 @@ class JobFolder:
             raise JobDamaged(
                 f"{file}: not readable ({error!r}). Delete the job and submit its capture again."
             ) from error
+
+    def write_spec(self, spec: JobSpec) -> None:
+        """Replace the specification."""
+        file = self.path / "job.json"
+        write_json(file, {**json.loads(file.read_text()), "spec": asdict(spec)})
 
     def created_at(self) -> float:
         """Unix seconds, which are the first part of the id."""
@@ -135,23 +158,37 @@ class Store:
         self.root = root.resolve()
         self._captures = self.root / "captures"
         self._jobs = self.root / "jobs"
+        self._submissions = self.root / "submissions"
         self.uploads = self.root / "uploads"
         self.workers = self.root / "workers"
-        for folder in (self._captures, self._jobs, self.uploads, self.workers):
+        for folder in (self._captures, self._jobs, self._submissions, self.uploads, self.workers):
             folder.mkdir(parents=True, exist_ok=True)
 
     def capture(self, digest: str) -> Path:
         """The folder with the files of a capture."""
         return capture_root(self._captures / digest)
 
-    def create(self, spec: JobSpec, unpacked: Path) -> str:
-        """Add a job whose capture is in the folder `unpacked`, which is moved into the store. Returns the id."""
+    def create(self, spec: JobSpec, unpacked: Path | None, key: str | None = None) -> str:
+        """Add a job whose capture is in the folder `unpacked`, which is moved into the store; None: one it has.
+
+        Returns its id; with a `key` that its owner has used, that of the job of then. Raises `OtherSubmission` if that
+        job was submitted differently, and `CaptureNotFound` where the capture is not there any more.
+        """
         now = time.time()
         job_id = f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
-        sync_tree(unpacked)  # after a power failure no job may be there without its images
-        with self._changing():
+        if unpacked is not None:
+            sync_tree(unpacked)  # after a power failure no job may be there without its images
+        submission = self._submissions / hashlib.sha256(f"{spec.owner} {key}".encode()).hexdigest()
+        with self.changing():
+            if key is not None and submission.exists():
+                if json.loads((submission / "job.json").read_text())["submitted"] != asdict(spec):
+                    raise OtherSubmission("This Idempotency-Key was used with other content. Choose a new one.")
+                return submission.resolve().name
             capture = self._captures / spec.capture
-            if _files(capture) == _files(unpacked):
+            if unpacked is None:
+                if not capture.is_dir():
+                    raise CaptureNotFound(spec.capture)
+            elif _files(capture) == _files(unpacked):
                 shutil.rmtree(unpacked)
             else:
                 # A new capture, or one with missing files: replace it with the complete upload.
@@ -163,9 +200,15 @@ class Store:
             # The folder is renamed after its record is written: a folder in jobs/ always has its record.
             part = self.uploads / f"{job_id}.job"
             part.mkdir()
-            write_json(part / "job.json", {"id": job_id, "created_at": now, "spec": asdict(spec)})
+            values = asdict(spec)
+            secret = "whsec_" + b64encode(os.urandom(32)).decode() if spec.webhook else None
+            stored = {"spec": {**values, "webhook_secret": secret}, "submitted": values}
+            write_json(part / "job.json", {"id": job_id, "created_at": now, **stored})
             part.rename(self._jobs / job_id)
             sync_folder(self._jobs)
+            if key is not None:
+                submission.unlink(missing_ok=True)  # that of a deleted job
+                submission.symlink_to(self._jobs / job_id)
         return job_id
 
     def folder(self, job_id: str) -> JobFolder:
@@ -183,13 +226,16 @@ class Store:
     def delete(self, job_id: str) -> None:
         """Remove a job, and its capture if no other job uses it. Raises `JobConflict` while its trainer runs."""
         folder = self.folder(job_id)
-        with self._changing(), locked(folder.lock, wait=False) as free:
+        with self.changing(), locked(folder.lock, wait=False) as free:
             if not free:
                 raise JobConflict(f"Job {job_id} is still writing its checkpoint. Try again in a few seconds.")
             deleted = self.uploads / f"{job_id}.deleted"
             os.utime(folder.path)  # so that no other process takes it for a leftover meanwhile
             folder.path.rename(deleted)
             shutil.rmtree(deleted)
+            for submission in self._submissions.iterdir():
+                if not submission.exists():
+                    submission.unlink()
             try:
                 used = {self.folder(other).spec().capture for other in self.ids()}
             except JobDamaged:
@@ -199,7 +245,7 @@ class Store:
                     shutil.rmtree(capture, ignore_errors=True)
 
     @contextmanager
-    def _changing(self) -> Iterator[None]:
+    def changing(self) -> Iterator[None]:
         """Only one process at a time adds or removes jobs and captures."""
         with locked(self.root / "store.lock"):
             yield

@@ -38,6 +38,7 @@ class TrainerChild:
         self._loop = asyncio.get_running_loop()
         self._process: asyncio.subprocess.Process | None = None
         self._stopping = False
+        self.told_checkpoint = folder.checkpoint()  # the newest that the webhook knows
 
     @property
     def stopping(self) -> bool:

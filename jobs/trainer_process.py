@@ -25,13 +25,17 @@ from graings.config import TrainConfig, restored
 from graings.errors import DivergedError, GraingsError
 from graings.report.events import Diverged
 from graings.report.folder import report_runs
+from graings.report.run_record import read_record
+from graings.storage.files import write_document
+from graings.storage.run_folder import RECORD_FILE
 from graings.training.calibration import calibration
 from graings.training.run import TrainingRun
 from graings.training.run_output import RunReport
 from jobs.exit_code import ExitCode
+from jobs.footage_phase import Stopped, capture_of
 from jobs.locks import locked
 from jobs.parent import watch_parent
-from jobs.progress import ProgressReport, ProgressWriter
+from jobs.progress import ProgressReport, ProgressWriter, last_progress
 from jobs.store import JobFolder, Store
 
 REPORT_EVERY_S = 1.0
@@ -68,6 +72,9 @@ def _train_or_report(folder: JobFolder, threads: int, stop: threading.Event) -> 
     """Train, and turn any error into an exit code and a message."""
     try:
         return _train(folder, threads, stop)
+    except Stopped:
+        _log("stopped while the capture was made; it continues there")
+        return ExitCode.STOPPED
     except DivergedError as error:
         return _end(ExitCode.DIVERGED, str(error))
     except GraingsError as error:
@@ -82,33 +89,45 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     spec = folder.spec()
     config = restored(TrainConfig, spec.config, folder.path)
     threads = min(config.threads or threads, threads)
-    capture = Store(folder.path.parent.parent).capture(spec.capture)
+    upload = Store(folder.path.parent.parent).capture(spec.capture)
     checkpoint = folder.checkpoint()
     attempts = folder.attempts()
     attempt = attempts[-1].number if attempts else 1
+    earlier, began = last_progress(folder.progress), time.monotonic()
+    phase_s = dict(earlier.phase_s) if earlier else {}
     progress = ProgressWriter(folder.progress)
+    capture, found = capture_of(upload, folder, threads, config.iterations, progress, stop)
+    for line in found:
+        _log(line)
     progress.write(
-        ProgressReport(phase="loading", iteration=checkpoint or 0, iterations=config.iterations, attempt=attempt)
+        ProgressReport(
+            phase="loading", iteration=checkpoint or 0, iterations=config.iterations, attempt=attempt, phase_s=phase_s
+        )
     )
     calibration(threads)  # the first job on a machine measures it; plans predict with it from then on
     if checkpoint is None:
         shutil.rmtree(folder.run, ignore_errors=True)  # the incomplete run of an attempt without a checkpoint
         run = TrainingRun.create(capture, folder.run, config.model_copy(update={"threads": threads}))
     else:
+        _extend(folder.run, config.iterations)
         run = TrainingRun.resume(folder.run, capture=capture, threads=threads)
     _log(f"attempt {attempt}: {threads} threads, from iteration {checkpoint or 0} of {config.iterations}")
 
     reported = logged = -LOG_EVERY_S
+    changed = time.monotonic()
+    phase_s["loading"] = phase_s.get("loading", 0.0) + changed - began
     held_out: dict[str, Any] = {}
     try:
         for report in run:
             now = time.monotonic()
+            phase_s[report.phase] = phase_s.get(report.phase, 0.0) + now - changed
+            changed = now
             if report.evaluation:
                 held_out = {"held_out_psnr": report.evaluation.psnr, "held_out_ssim_3dgs": report.evaluation.ssim_3dgs}
             # Events are reported at once, so that clients see a rollback without delay.
             last = report.iteration == report.iterations
             if report.events or report.evaluation or last or now - reported >= REPORT_EVERY_S:
-                progress.write(ProgressReport(**_values(report), **held_out, attempt=attempt))
+                progress.write(ProgressReport(**_values(report), **held_out, attempt=attempt, phase_s=phase_s))
                 reported = now
             if now - logged >= LOG_EVERY_S or report.evaluation or report.events:
                 _log(_line(report))
@@ -132,6 +151,14 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     _report(folder)
     _log("finished")
     return ExitCode.DONE
+
+
+def _extend(run: Path, iterations: int) -> None:
+    """Let a run that was extended go on; its rates decay as those of a run of the new length."""
+    record = read_record(run)
+    if record.config.iterations < iterations:
+        longer = record.config.model_copy(update={"iterations": iterations})
+        write_document(run / RECORD_FILE, record.model_copy(update={"config": longer}))
 
 
 def _report(folder: JobFolder) -> None:

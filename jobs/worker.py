@@ -14,14 +14,17 @@ import socket
 import sys
 import threading
 import time
-from typing import NoReturn
+from collections.abc import Iterable
+from typing import Any, NoReturn
 
 from jobs.engine import Engine, executing
 from jobs.exit_code import OUT_OF_MEMORY, ExitCode
-from jobs.job import Attempt, JobError, JobState, Outcome
+from jobs.job import Attempt, JobError, JobNotFound, JobState, Outcome
 from jobs.lease import Leases, open_leases
+from jobs.queue import JobQueue
 from jobs.store import Store
 from jobs.trainer_child import GRACE_S, ProcessExit, TrainerChild
+from jobs.webhooks import RETRY_AFTER_S, WebhookError, deliver
 
 LOG = logging.getLogger(__name__)
 
@@ -34,13 +37,23 @@ MAX_WORKER_DEATHS = 5
 class Worker:
     """One worker process: `slots` jobs at a time, `threads` CPU threads each, with a priority lowered by `nice`."""
 
-    def __init__(self, store: Store, database_url: str, *, slots: int = 1, threads: int = 1, nice: int = 0) -> None:
+    def __init__(
+        self,
+        store: Store,
+        database_url: str,
+        *,
+        slots: int = 1,
+        threads: int = 1,
+        nice: int = 0,
+        private_webhooks: bool = False,
+    ) -> None:
         self.id = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
         self._store = store
         self._url = database_url
         self._slots = slots
         self._threads = threads
         self._nice = nice
+        self._private_webhooks = private_webhooks
         self._trainers: dict[str, TrainerChild] = {}
         self._stopping = False
 
@@ -49,12 +62,13 @@ class Worker:
 
         If the database does not answer then, this ends the process, because threads of DBOS would keep it alive.
         """
-        engine = Engine(self._url)
+        engine = self._engine = Engine(self._url)
+        self._queue = JobQueue(self._store, engine)
         leases = open_leases(self._url, self._store.workers)
         if not leases.acquire(self.id):
             raise JobError(f"The lease of worker {self.id} is held by another process. Start the worker again.")
         try:
-            with executing(self._url, self.id, self._slots, self._work):
+            with executing(self._url, self.id, self._slots, self._work, self._deliver):
                 LOG.info("worker %s takes jobs: %d at a time, %d threads each", self.id, self._slots, self._threads)
                 self._supervise(engine, leases, stop)
                 self._stop_all()
@@ -85,6 +99,7 @@ class Worker:
                 # Before the query: the job of a trainer that starts in between is not in its result yet.
                 trainers = list(self._trainers.items())
                 running = {entry.job_id: entry.executor for entry in engine.running()}
+                self._tell_checkpoints(trainers)
                 requeue_jobs_of_dead_workers(engine, leases, self.id, running)
                 for job_id, trainer in trainers:
                     if running.get(job_id) != self.id and not trainer.stopping:
@@ -98,6 +113,35 @@ class Worker:
                 LOG.exception("worker %s failed to check its jobs", self.id)
             if stop.wait(ROUND_S):
                 return
+
+    def _tell(self, job_id: str, event: str, number: int = 0, **changes: Any) -> None:
+        """Tell the webhook of a job, if it has one; a database that does not answer must not end the training."""
+        try:
+            self._queue.tell(job_id, event, number, **changes)
+        except JobError as error:
+            LOG.warning("job %s: its webhook is not told of %s: %s", job_id, event, error)
+
+    def _tell_checkpoints(self, trainers: Iterable[tuple[str, TrainerChild]]) -> None:
+        for job_id, trainer in trainers:
+            newest = self._store.folder(job_id).checkpoint()
+            if newest is not None and newest != trainer.told_checkpoint:
+                trainer.told_checkpoint = newest
+                self._tell(job_id, "checkpoint", newest)
+
+    def _deliver(self, message_id: str, job_id: str, content: dict[str, Any], attempt: int) -> None:
+        """Send a message; if the receiver does not take it, have it sent again later."""
+        try:
+            spec = self._store.folder(job_id).spec()
+            if spec.webhook and spec.webhook_secret:
+                private = self._private_webhooks
+                deliver(spec.webhook, spec.webhook_secret, message_id, content, private=private)
+        except JobNotFound:
+            return  # deleted meanwhile
+        except WebhookError as error:
+            again = attempt < len(RETRY_AFTER_S)
+            LOG.warning("job %s: webhook, attempt %d: %s%s", job_id, attempt + 1, error, "" if again else "; given up")
+            if again:
+                self._engine.send(message_id, job_id, content, attempt + 1, RETRY_AFTER_S[attempt])
 
     def _stop_all(self) -> None:
         self._stopping = True
@@ -114,8 +158,9 @@ class Worker:
             reason = give_up_reason(folder.attempts(), folder.checkpoint() or 0)
             if reason is not None:
                 folder.close_attempts()
-                return Outcome(JobState.FAILED, reason)
+                return await self._ended(job_id, folder.attempts()[-1].number, Outcome(JobState.FAILED, reason))
             attempt = folder.begin_attempt(self.id)
+            await asyncio.to_thread(self._tell, job_id, "started", attempt.number)
             LOG.info("job %s: attempt %d from iteration %d", job_id, attempt.number, attempt.checkpoint)
             trainer = TrainerChild(folder, self._threads, nice=self._nice)
             try:
@@ -128,12 +173,17 @@ class Worker:
             outcome = _outcome(ending)
             if outcome is not None:
                 folder.close_attempts()
-                return outcome
+                return await self._ended(job_id, attempt.number, outcome)
             if trainer.stopping and not self._stopping:
                 raise JobError(f"Job {job_id} was taken from worker {self.id}.")
         # The worker is stopping: its job goes back to the queue, without an outcome.
         await asyncio.Event().wait()
         raise AssertionError("unreachable: only cancellation ends the wait")
+
+    async def _ended(self, job_id: str, number: int, outcome: Outcome) -> Outcome:
+        changes = {"state": outcome.state, "error": outcome.error, "finished_at": time.time()}
+        await asyncio.to_thread(self._tell, job_id, "ended", number, **changes)
+        return outcome
 
     async def _run_trainer(self, job_id: str, trainer: TrainerChild) -> ProcessExit:
         """Run a trainer, registered so that `_supervise` can stop it."""
@@ -154,13 +204,15 @@ def requeue_jobs_of_dead_workers(engine: Engine, leases: Leases, own: str, runni
 
     `own` is the id of this worker, `running` the worker of each running job.
     """
-    for executor in sorted({worker for worker in running.values() if worker is not None and worker != own}):
+    workers = {*running.values(), *engine.delivering().values()}
+    for executor in sorted({worker for worker in workers if worker is not None and worker != own}):
         if not leases.acquire_from_dead(executor):
             continue  # alive, or another worker requeues its jobs
         try:
             job_ids = [entry.job_id for entry in engine.running() if entry.executor == executor]
             LOG.warning("worker %s died: back in the queue: %s", executor, ", ".join(job_ids) or "nothing")
             engine.requeue(job_ids)
+            engine.requeue_messages(executor)
         finally:
             leases.release(executor)
 

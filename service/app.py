@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 from anyio import to_thread
 from fastapi import Depends, FastAPI
@@ -18,7 +19,8 @@ from service.access import authorize
 from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
-from service.routes import jobs, plans, render, results, scenes, sessions, system
+from service.head import Head
+from service.routes import captures, export, jobs, plans, render, results, scenes, sessions, system
 from service.same_origin import SameOrigin
 from service.security_headers import SecurityHeaders
 from service.settings import Settings
@@ -28,6 +30,15 @@ _SMALL_BODY = 64 * 1024
 # A thread that wants to run Python waits for so long before it interrupts another; the default is 5 ms, and a short
 # request that meets two images at work would wait for it several times.
 SWITCH_S = 0.001
+
+
+class Service(FastAPI):
+    """The application, with the schemas of its errors in its description."""
+
+    def openapi(self) -> dict[str, Any]:
+        document = super().openapi()
+        document["components"]["schemas"].update(problems.SCHEMAS)
+        return document
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -44,10 +55,10 @@ def create_app(settings: Settings) -> FastAPI:
             await to_thread.run_sync(app.state.context.close)
 
     def limit(method: str, path: str) -> int:
-        uploads = method == "POST" and path in ("/jobs", "/plans")
+        uploads = method == "POST" and path in ("/jobs", "/plans", "/captures")
         return settings.max_upload_mb * MB if uploads else _SMALL_BODY
 
-    app = FastAPI(
+    app = Service(
         title="GrainGS",
         version=graings.__version__,
         summary="See a moving scene from anywhere, at any time, with nothing but a CPU.",
@@ -60,8 +71,9 @@ def create_app(settings: Settings) -> FastAPI:
     problems.install(app)
     # Added last, so that it comes first: a refused request costs next to nothing.
     app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
+    app.add_middleware(Head)
     app.add_middleware(SecurityHeaders)
-    for routes in (jobs, plans, results, render, scenes, sessions, system):
+    for routes in (captures, jobs, plans, results, export, render, scenes, sessions, system):
         app.include_router(routes.router, dependencies=[Depends(authorize)])
     for routes in (sessions, system):
         app.include_router(routes.open_router)

@@ -15,6 +15,9 @@ from anyio import BrokenWorkerProcess, to_process
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig, TrainConfig
 from graings.errors import CaptureError
+from graings.footage.source import find_footage
+from graings.inspection import inspect as inspection
+from graings.inspection.document import Inspection
 from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan
 from graings.plan.survey import survey
@@ -44,6 +47,12 @@ async def plan_capture(folder: Path, config: TrainConfig) -> Plan:
     return Plan.model_validate_json(planned)
 
 
+async def describe_capture(folder: Path, config: CaptureConfig) -> Inspection:
+    """The inspection of the unpacked capture. Raises `CaptureError` as `inspect_capture` does."""
+    described = await apart(_describe, folder, config)
+    return Inspection.model_validate_json(described)
+
+
 async def apart(look: Callable[..., Found | Defect], *arguments: object) -> Found:
     """What `look` finds in another process. Raises `CaptureError` for a defect."""
     try:
@@ -62,6 +71,8 @@ async def apart(look: Callable[..., Found | Defect], *arguments: object) -> Foun
 
 def _find_defect(folder: Path, config: CaptureConfig) -> Defect | None:
     root = capture_root(folder)
+    if find_footage(root) is not None:
+        return None  # the job finds its cameras first, and says there what is wrong
     try:
         load_capture(root, config)
     except CaptureError as error:
@@ -72,10 +83,28 @@ def _find_defect(folder: Path, config: CaptureConfig) -> Defect | None:
 def _make_plan(folder: Path, config: TrainConfig) -> Defect | str:
     """The plan as JSON. The service measures no times itself: it uses the calibration of an earlier training."""
     root = capture_root(folder)
+    if (footage := find_footage(root)) is not None:
+        return _without_cameras("a plan", footage)
     try:
         return survey(root, config, stored_calibration()).model_dump_json(by_alias=True)
     except CaptureError as error:
         return defect(root, error)
+
+
+def _describe(folder: Path, config: CaptureConfig) -> Defect | str:
+    """The inspection as JSON."""
+    root = capture_root(folder)
+    if (footage := find_footage(root)) is not None:
+        return _without_cameras("an inspection", footage)
+    try:
+        return inspection.inspect_capture(root, config, stored_calibration())[0].model_dump_json(by_alias=True)
+    except CaptureError as error:
+        return defect(root, error)
+
+
+def _without_cameras(what: str, footage: Path) -> Defect:
+    remedy = "Submit it as a job, or make a capture of it first: graings capture."
+    return Defect(f"{what} needs the cameras, which are not known yet", footage.name, None, remedy)
 
 
 def defect(root: Path, error: CaptureError) -> Defect:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from datetime import datetime
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -18,20 +17,12 @@ app = typer.Typer(no_args_is_help=True, help="Make, list and revoke the keys of 
 Data = Annotated[Path, typer.Option(envvar="GRAINGS_DATA", help="The service's folder with captures and jobs.")]
 
 
-class KeyScope(StrEnum):
-    """The scopes of keys: all but that of links."""
-
-    READ = Scope.READ.value
-    TRAIN = Scope.TRAIN.value
-    ADMIN = Scope.ADMIN.value
-
-
 @app.command()
 def create(
     scope: Annotated[
-        KeyScope,
+        Literal["read", "train", "admin"],
         typer.Option(
-            help="read: see and render its own jobs; train: also submit and change them; admin: the jobs of all."
+            help="read: see and render its own jobs; train: also submit and change them; admin: the jobs of all.",
         ),
     ],
     name: Annotated[str, typer.Option(help="Whose key it is, for `keys list`.")],

@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from types import MappingProxyType
 from typing import Any
@@ -15,17 +15,27 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, Field
+from pydantic.json_schema import models_json_schema
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
+from starlette.routing import Match, Mount
 
 from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError
-from jobs.job import JobConflict, JobDamaged, JobError, JobNotFound
+from jobs.job import CaptureNotFound, JobConflict, JobDamaged, JobError, JobNotFound, OtherSubmission
 
 LOG = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 _TYPES = "urn:graings:problem:"
+
+
+class WrongParameter(BaseModel):
+    """A parameter that was refused."""
+
+    loc: list[str | int] = Field(description="Where it is.")
+    msg: str = Field(description="What is wrong with it.")
+    type: str = Field(description="Names the kind of error.")
 
 
 class Problem(BaseModel):
@@ -36,7 +46,7 @@ class Problem(BaseModel):
     status: int
     detail: str | None = None
     instance: str | None = None
-    errors: list[dict[str, Any]] | None = Field(None, description="The wrong parameters and what is wrong with each.")
+    errors: list[WrongParameter] = Field([], description="The wrong parameters and what is wrong with each.")
 
 
 class ServiceError(Exception):
@@ -93,6 +103,12 @@ class NotYet(ServiceError):
     """A result that the job does not have yet."""
 
 
+class Busy(ServiceError):
+    """The service does as much of this kind as it can."""
+
+    headers = MappingProxyType({"Retry-After": "5"})
+
+
 class NotAcceptable(ServiceError):
     """The service has no format that the client accepts."""
 
@@ -100,8 +116,10 @@ class NotAcceptable(ServiceError):
 # The first matching class counts.
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (JobNotFound, 404, "no-such-job"),
+    (CaptureNotFound, 404, "no-such-capture"),
     (JobConflict, 409, "state-conflict"),
     (JobDamaged, 500, "job-damaged"),
+    (OtherSubmission, 422, "idempotency-key-reused"),
     (JobError, 503, "jobs-unavailable"),
     (BadRequest, 422, "bad-parameter"),
     (ArchiveError, 422, "capture-rejected"),
@@ -110,6 +128,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (Unauthorized, 401, "no-key"),
     (Forbidden, 403, "not-allowed"),
     (TooManyRequests, 429, "too-many-requests"),
+    (Busy, 503, "busy"),
     (NotAcceptable, 406, "not-acceptable"),
     (ClientDisconnect, 400, "disconnected"),
     (ConfigError, 422, "bad-config"),
@@ -127,16 +146,15 @@ _DETAILS = {
     405: "This address does not accept the method; the header Allow lists the methods that it accepts.",
 }
 
+_CONTENT = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {
-        "description": "An error in the request",
-        "content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}},
-    },
-    "5XX": {
-        "description": "An error in the service",
-        "content": {MEDIA_TYPE: {"schema": Problem.model_json_schema()}},
-    },
+    "4XX": {"description": "An error in the request", "content": _CONTENT},
+    "5XX": {"description": "An error in the service", "content": _CONTENT},
 }
+# The schemas that this refers to: the framework knows only those of answers without an error.
+SCHEMAS: dict[str, Any] = models_json_schema([(Problem, "serialization")], ref_template="#/components/schemas/{model}")[
+    1
+]["$defs"]
 
 
 def problem(
@@ -145,7 +163,7 @@ def problem(
     detail: str | None = None,
     *,
     kind: str | None = None,
-    errors: list[dict[str, Any]] | None = None,
+    errors: Sequence[WrongParameter] = (),
     headers: Mapping[str, str] | None = None,
 ) -> Response:
     """A problem document as a response."""
@@ -155,9 +173,10 @@ def problem(
         status=status,
         detail=detail,
         instance=request.url.path,
-        errors=errors,
+        errors=list(errors),
     )
-    text = json.dumps(document.model_dump(exclude_none=True), ensure_ascii=False, allow_nan=False)
+    values = document.model_dump(exclude_none=True, exclude=None if errors else {"errors"})
+    text = json.dumps(values, ensure_ascii=False, allow_nan=False)
     # A request may contain half of a surrogate pair, as "\\ud800" in JSON, which UTF-8 cannot encode.
     return Response(text.encode("utf-8", "replace"), status, media_type=MEDIA_TYPE, headers=headers)
 
@@ -178,12 +197,13 @@ def install(app: FastAPI) -> None:
         assert isinstance(error, HTTPException)
         phrase = HTTPStatus(error.status_code).phrase
         detail = _DETAILS.get(error.status_code) if error.detail == phrase else str(error.detail)
-        return problem(request, error.status_code, detail, headers=dict(error.headers) if error.headers else None)
+        headers = {"Allow": _allowed(request)} if error.status_code == 405 else error.headers
+        return problem(request, error.status_code, detail, headers=headers)
 
     async def validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
         # Without the offending input: it may be large, secret or NaN.
-        errors = [{"loc": list(e["loc"]), "msg": e["msg"], "type": e["type"]} for e in error.errors()]
+        errors = [WrongParameter(loc=e["loc"], msg=e["msg"], type=e["type"]) for e in error.errors()]
         detail = "; ".join(f"{'.'.join(str(part) for part in e['loc'][1:])}: {e['msg']}" for e in error.errors())
         return problem(request, 422, detail, kind="bad-parameter", errors=errors)
 
@@ -204,6 +224,19 @@ def install(app: FastAPI) -> None:
     # Starlette's own handler for all errors raises the error again after its response, and a server then drops the
     # connection. This one does not.
     app.add_middleware(_CatchAll, answer=unexpected)
+
+
+def _allowed(request: Request) -> str:
+    """The methods of an address: the framework names only those of the first route that has it."""
+
+    def match(method: str) -> bool:
+        scope = {**request.scope, "method": method}
+        return any(
+            route.matches(scope)[0] is Match.FULL for route in request.app.routes if not isinstance(route, Mount)
+        )
+
+    methods = [method for method in ("GET", "POST", "PUT", "PATCH", "DELETE") if match(method)] or ["GET"]
+    return ", ".join(["HEAD", *methods] if "GET" in methods else methods)
 
 
 class _CatchAll:

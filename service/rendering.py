@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
-import numpy as np
-
 from graings.camera.camera import Camera
 from graings.errors import CheckpointError
-from graings.image_encoding import ImageFormat, encode_image
-from graings.render import MotionBasisReport, PreparedScene, fast_scene, render_composition
+from graings.export.picture import Content, picture
+from graings.image_encoding import ImageFormat
+from graings.render import MotionBasisReport, PreparedScene, fast_scene
 from graings.storage.compact import open_model
 from graings.storage.model import Model, scene_bytes
 from graings.storage.run_folder import newest_model
@@ -44,6 +43,7 @@ class RenderRequest:
     time: float
     background: tuple[float, float, float]
     format: ImageFormat
+    content: Content = "color"
     fast: bool = False
 
 
@@ -175,16 +175,20 @@ def _lower_priority() -> None:
 
 
 def _rendered(loaded: LoadedModel, request: RenderRequest, queued: float) -> EncodedImage:
-    marks = [("queue", queued)]
+    seconds = dict[str, float]()
+    last = queued
+
+    def note(part: str) -> None:
+        nonlocal last
+        now = perf_counter()
+        seconds[part] = now - last
+        last = now
+
+    note("queue")
     scene = loaded.fast()[0] if request.fast else loaded.scene
-    marks.append(("scene", perf_counter()))
-    composition = scene.compose(request.camera.center, request.time)
-    marks.append(("raster", perf_counter()))
-    result = render_composition(composition, request.camera, request.background)
-    marks.append(("encode", perf_counter()))
-    data = encode_image(np.asarray(result.color, dtype=np.float32), request.format)
-    ends = [mark for _, mark in marks[1:]] + [perf_counter()]
-    return EncodedImage(data, {name: end - begin for (name, begin), end in zip(marks, ends, strict=True)})
+    view = (request.camera, request.time, request.background)
+    data = picture(scene, *view, loaded.model.units, request.content, request.format, note=note)
+    return EncodedImage(data, seconds)
 
 
 def _key(path: Path) -> _Key | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from time import time
 from typing import Any
 
 from pydantic import BaseModel, Field
@@ -21,6 +22,7 @@ class JobSummary(BaseModel):
     created_at: datetime = Field(description="When it was submitted.")
     started_at: datetime | None = Field(description="When its trainer was first started; null before.")
     finished_at: datetime | None = Field(description="When it ended; null before.")
+    queued_s: float = Field(description="Seconds from its submission to its first start, or until now or its end.")
     attempts: int = Field(description="How often the trainer was started.")
     progress: ProgressReport | None = Field(description="The trainer's last report; null before the first.")
     checkpoint: int | None = Field(description="Iteration of the newest checkpoint, which `/render` shows.")
@@ -32,6 +34,8 @@ class JobResource(JobSummary):
     """A training job."""
 
     capture: str = Field(description="sha256 of the uploaded archive.")
+    webhook: str | None = Field(description="Address that is told what happens to the job.")
+    webhook_secret: str | None = Field(None, description="Verifies its messages; only in the answer to the submission.")
     config: dict[str, Any] = Field(description="All options of the run; `GET /options` has their schema.")
 
 
@@ -70,7 +74,9 @@ class Readiness(BaseModel):
 
 def job_resource(job: Job) -> JobResource:
     """The resource of a job."""
-    return JobResource(**dict(job_summary(job)), capture=job.spec.capture, config=job.spec.config)
+    return JobResource(
+        **dict(job_summary(job)), capture=job.spec.capture, webhook=job.spec.webhook, config=job.spec.config
+    )
 
 
 def job_summary(job: Job) -> JobSummary:
@@ -81,10 +87,12 @@ def job_summary(job: Job) -> JobSummary:
         links["cancel"] = f"{base}/cancel"
     elif job.state is JobState.CANCELLED:
         links["resume"] = f"{base}/resume"
-    elif job.state is not JobState.SUCCEEDED:
+    elif job.state is JobState.SUCCEEDED:
+        links["extend"] = f"{base}/extend"
+    else:
         links["retry"] = f"{base}/retry"
     if job.checkpoint is not None or job.has_model:
-        links["render"] = f"/render?job={job.id}"
+        links |= {"render": f"/render?job={job.id}", "export": f"{base}/export?format=ply"}
         links["views"] = f"{base}/views"
         links["scene"] = f"{base}/scene" + ("" if job.checkpoint is None else f"?checkpoint={job.checkpoint}")
         links["comparison"] = f"{base}/comparison"
@@ -102,6 +110,7 @@ def job_summary(job: Job) -> JobSummary:
         created_at=moment(job.created_at),
         started_at=None if job.started_at is None else moment(job.started_at),
         finished_at=None if job.finished_at is None else moment(job.finished_at),
+        queued_s=(job.started_at or job.finished_at or time()) - job.created_at,
         attempts=job.attempts,
         progress=job.progress,
         checkpoint=job.checkpoint,

@@ -19,6 +19,7 @@ from anyio import open_file, to_thread
 from starlette.datastructures import FormData, UploadFile
 from starlette.requests import Request
 
+from graings.footage.source import video_suffix
 from jobs.store import discard_leftovers
 from service.archives import Limits, unpack
 from service.problems import BadRequest
@@ -29,8 +30,13 @@ _BINARY = {"schema": {"type": "string", "format": "binary"}}
 _FORM = {
     "type": "object",
     "required": ["capture"],
+    "additionalProperties": False,
     "properties": {
-        "capture": {"type": "string", "format": "binary", "description": "A zip, tar or tar.gz of the capture."},
+        "capture": {
+            "type": "string",
+            "format": "binary",
+            "description": "A zip, tar or tar.gz; or a video.",
+        },
         "config": {"type": "string", "description": "Options as a JSON object, which override those of the query."},
     },
 }
@@ -38,8 +44,10 @@ _FORM = {
 CAPTURE_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
-        "description": "The capture, in one of the formats that are read from a folder, packed as zip, tar or tar.gz.",
+        "description": "The capture, in one of the formats that are read from a folder, packed as zip, tar or tar.gz. "
+        "Or a video, or an archive of photographs without poses: the job then finds their cameras first.",
         "content": {
+            "video/*": _BINARY,
             "application/zip": _BINARY,
             "application/x-tar": _BINARY,
             "application/gzip": _BINARY,
@@ -75,8 +83,13 @@ async def receive_capture(request: Request, uploads: Path, limits: Limits) -> As
                 digest = await _store_file(_capture_field(form), archive)
         else:
             config, digest = {}, await _store_stream(request, archive)
-        await to_thread.run_sync(unpack, archive, folder, limits)
-        archive.unlink()
+        suffix = await to_thread.run_sync(video_suffix, archive)
+        if suffix is None:
+            await to_thread.run_sync(unpack, archive, folder, limits)
+            archive.unlink()
+        else:
+            folder.mkdir()
+            archive.rename(folder / f"video{suffix}")
         yield Upload(folder, digest, config)
     finally:
         archive.unlink(missing_ok=True)

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("graings", "jobs", "service")
+PACKAGES = ("graings", "jobs", "service", "client")
 
 # What everybody may use, whichever package it is in.
 GROUND = (
     "graings",
+    "graings.colmap",
     "graings.constants",
     "graings.document",
     "graings.errors",
@@ -32,10 +33,15 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.scene": ("graings.camera", "graings.config", "graings.kernel"),
     "graings.raster": ("graings.camera", "graings.kernel"),
     "graings.render": ("graings.camera", "graings.raster", "graings.scene"),  # they meet here and nowhere else
+    "graings.matching": ("graings.camera", "graings.capture"),
     "graings.plan": ("graings.capture", "graings.config"),
+    "graings.inspection": (
+        *("graings.camera", "graings.capture", "graings.config", "graings.matching", "graings.plan"),
+        *("graings.report.figure_files", "graings.scene.memory"),
+    ),
     "graings.evaluation": ("graings.capture", "graings.render", "graings.scene"),
     "graings.storage": ("graings.camera", "graings.config", "graings.scene"),
-    "graings.export": ("graings.camera", "graings.render", "graings.scene", "graings.storage"),
+    "graings.export": ("graings.camera", "graings.raster", "graings.render", "graings.scene", "graings.storage"),
     "graings.player": ("graings.camera", "graings.export", "graings.render", "graings.scene", "graings.storage"),
     "graings.report": (
         *(
@@ -55,6 +61,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
             "graings.config",
             "graings.evaluation",
             "graings.kernel",
+            "graings.matching",
             "graings.plan",
         ),
         *("graings.raster", "graings.render", "graings.report", "graings.scene", "graings.storage"),
@@ -62,20 +69,23 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.ablation": ("graings.capture", "graings.config", "graings.report", "graings.storage", "graings.training"),
     "graings.cli": (
         *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
-        *("graings.export", "graings.footage", "graings.kernel", "graings.plan", "graings.player", "graings.render"),
-        *("graings.report", "graings.storage", "graings.training"),
+        *("graings.export", "graings.footage", "graings.inspection", "graings.kernel", "graings.plan"),
+        *("graings.player", "graings.render", "graings.report", "graings.storage", "graings.training"),
     ),
     # Durable work knows the method by its options and files; one child process trains.
     "jobs": (
         *("graings.config", "graings.document", "graings.report.events", "graings.storage.files"),
         "graings.storage.run_folder",
     ),
-    "jobs.trainer_process": ("graings.config", "graings.report", "graings.training", "jobs"),
+    "jobs.footage_phase": ("graings.footage", "jobs"),
+    "jobs.trainer_process": ("graings.config", "graings.report", "graings.storage", "graings.training", "jobs"),
+    # What a program elsewhere uses: it knows nothing but HTTP.
+    "client": (),
     # HTTP never trains.
     "service": (
         *("graings.camera", "graings.capture", "graings.config", "graings.evaluation", "graings.export"),
-        *("graings.kernel", "graings.plan", "graings.player", "graings.render", "graings.report", "graings.storage"),
-        "jobs",
+        *("graings.footage.source", "graings.inspection", "graings.kernel", "graings.plan", "graings.player"),
+        *("graings.render", "graings.report", "graings.storage", "jobs"),
     ),
 }
 
@@ -87,19 +97,24 @@ HOMES: dict[str, tuple[str, ...]] = {
     "uvicorn": ("service",),
     "werkzeug": ("service.routes.render",),
     "limits": ("service.request_limits",),
-    "typer": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
-    "rich": ("graings.cli", "jobs.commands", "service.commands", "service.demo", "service.key_commands"),
+    "httpx2": ("client", "jobs.webhooks"),
+    "standardwebhooks": ("jobs.webhooks",),
+    "PIL": ("client.calls",),
+    "typer": ("graings.cli", "jobs.commands", "service.commands", "client.demo", "service.key_commands"),
+    "rich": ("graings.cli", "jobs.commands", "service.commands", "client.demo", "service.key_commands"),
     "OpenImageIO": ("graings.capture", "graings.footage.photos", "graings.image_encoding"),
-    "pycolmap": ("graings.capture", "graings.footage", "graings.training.initialization"),
-    "av": ("graings.footage.video",),
+    "pycolmap": ("graings.capture", "graings.colmap", "graings.footage", "graings.matching"),
     "lpips": ("graings.evaluation.perceptual",),
     "flip_evaluator": ("graings.evaluation.perceptual",),
-    "matplotlib": ("graings.report", "graings.ablation.plot"),
+    "matplotlib": ("graings.report", "graings.ablation.plot", "graings.inspection.picture"),
+    "plyfile": ("graings.capture.readers.ply", "graings.export.ply"),
+    "gaussforge": ("graings.export.formats",),
+    "av": ("graings.export", "graings.footage.video"),
     "safetensors": ("graings.storage.checkpoint", "graings.storage.compact"),
 }
 
 # Optional extras, and what takes long to import and is not always used.
-MAY_BE_IMPORTED_LATE = {"av", "pycolmap", "lpips", "flip_evaluator", "matplotlib"}
+MAY_BE_IMPORTED_LATE = {"av", "gaussforge", "pycolmap", "lpips", "flip_evaluator", "matplotlib", "numpy", "PIL"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 

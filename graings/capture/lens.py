@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from graings.colmap import import_pycolmap
+
 if TYPE_CHECKING:
     import pycolmap
 
@@ -43,8 +45,7 @@ class Lens:
         if model in PINHOLE_AT_ZERO_DISTORTION and not any(distortion):
             return None
         # An optional extra: an import at the top of the module would make every capture depend on it.
-        import pycolmap
-
+        pycolmap = import_pycolmap()
         camera = _camera(model, params, size)
         undistorted = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
         fx, fy, cx, cy = (float(value) for value in undistorted.params)
@@ -91,7 +92,7 @@ class Lens:
 
 
 def _camera(model: str, params: tuple[float, ...], size: tuple[int, int]) -> pycolmap.Camera:
-    import pycolmap  # optional extra, as above
+    pycolmap = import_pycolmap()
 
     camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
     if not camera.verify_params():

@@ -7,12 +7,10 @@ the entry-point group `graings.commands`.
 from __future__ import annotations
 
 import errno
-import json
 import sys
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from time import perf_counter
 from typing import Annotated, Any, Final, Literal, NoReturn
 
 import typer
@@ -20,25 +18,23 @@ import typer.core
 from rich.console import Console
 from rich.text import Text
 
-from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.camera.viewpoint import background_rgb
+from graings.cli.exporting import export
 from graings.cli.footage import capture
+from graings.cli.inspecting import inspect
 from graings.cli.option_table import show_options
 from graings.cli.planning import plan
+from graings.cli.rendering import render_view
 from graings.cli.synthesize import synthesize
 from graings.cli.terminal import metrics_line, motion_line, print_line
 from graings.cli.training import MultiValueCommand, Threads, ablate, train
+from graings.cli.video import video
 from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
-from graings.evaluation.metrics import psnr
-from graings.image_encoding import encode_image, image_format
 from graings.kernel import use_threads
-from graings.render import PreparedScene, fast_scene, render
 from graings.report.evaluate_run import evaluate_run
 from graings.report.folder import report_runs
 from graings.report.metrics_document import METRICS_FILE, read_metrics
 from graings.report.work_precision import summary
-from graings.storage.compact import SUFFIX, open_model, write_compact
-from graings.storage.model import scene_bytes
 
 UNAVAILABLE: Final = 69  # after sysexits.h, as the others
 EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (
@@ -62,9 +58,6 @@ EPILOG: Final = (
 )
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
-ModelPath = Annotated[
-    Path, typer.Argument(metavar="RUN", help="Folder of a run, one of its checkpoints, or an exported .graings file.")
-]
 
 
 class Commands(typer.core.TyperGroup):
@@ -93,93 +86,14 @@ def graings() -> None:
 
 app.command()(train)
 app.command()(plan)
+app.command()(inspect)
 app.command()(synthesize)
 app.command()(capture)
 app.command(cls=MultiValueCommand)(ablate)
+app.command(name="render")(render_view)
+app.command()(video)
+app.command()(export)
 app.command(name="options")(show_options)
-
-
-@app.command(name="render")
-def render_view(
-    run: ModelPath,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Image file: .png, .jpg, .webp or .exr.")],
-    t: Annotated[float | None, typer.Option(help="Time from 0 to 1 (default: that of --camera, or 0).")] = None,
-    camera: Annotated[str | None, typer.Option(help="A view of the capture, such as test:3.")] = None,
-    azimuth: Annotated[float | None, typer.Option(help="Degrees about the vertical axis (default: 0).")] = None,
-    elevation: Annotated[
-        float | None, typer.Option(help="Degrees above the horizon (default: median of the training views).")
-    ] = None,
-    radius: Annotated[
-        float | None, typer.Option(help="Distance to the target in the capture's units (default: median).")
-    ] = None,
-    target: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="Point to look at, in the capture's units (default: the centre)."),
-    ] = None,
-    fov: Annotated[float | None, typer.Option(help="Horizontal field of view in degrees.")] = None,
-    pose: Annotated[
-        Path | None,
-        typer.Option(help="JSON: world_to_camera (4x4, OpenCV axes), fx, width, height; optional: fy, cx, cy."),
-    ] = None,
-    width: Annotated[int | None, typer.Option(min=1, max=MAX_SIDE, help="Pixels.")] = None,
-    height: Annotated[int | None, typer.Option(min=1, max=MAX_SIDE, help="Pixels.")] = None,
-    background: Annotated[
-        str | None, typer.Option(help="white, black, #rrggbb or r,g,b (default: as in training).")
-    ] = None,
-    fast: Annotated[
-        bool,
-        typer.Option(
-            "--fast", help="Approximate the motion, as /render?fast=true does, and print how far it is from exact."
-        ),
-    ] = False,
-    threads: Threads = None,
-) -> None:
-    """Render one view at one time; without --camera or --pose, an orbit around the scene."""
-    use_threads(threads)
-    try:
-        format = image_format(output.suffix)
-        request = ViewRequest(
-            camera=camera,
-            azimuth=azimuth,
-            elevation=elevation,
-            radius=radius,
-            target=target,
-            fov=fov,
-            pose=None if pose is None else _read_pose(pose),
-            width=width,
-            height=height,
-            t=t,
-            background=background,
-        )
-        model = open_model(run)
-        view, time, rgb = request.resolve(model.views, model.units, model.background)
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from error
-    if t is not None and time != t:
-        print_line(f"Time {t:g} is outside the capture; rendered at {time:g}.")
-    scene, approximation = PreparedScene(model.scene), None
-    if fast:
-        exact = render(scene, view, time, rgb).color
-        scene, approximation = fast_scene(scene, model.views.get("train", ()))
-    started = perf_counter()
-    result = render(scene, view, time, rgb)
-    milliseconds = 1e3 * (perf_counter() - started)
-    output.write_bytes(encode_image(result.color.numpy(), format))
-    print_line(f"{output}: {view.width} x {view.height} at t = {time:g}, rendered in {milliseconds:.0f} ms.")
-    if approximation is not None:
-        print_line(f"Fast: {approximation.line}.")
-        print_line(f"This image has a PSNR of {psnr(result.color, exact):.1f} dB against the exact one.")
-
-
-@app.command()
-def export(
-    run: ModelPath,
-    output: Annotated[Path, typer.Option("--output", "-o", help=f"File to write, such as scene{SUFFIX}.")],
-) -> None:
-    """Write a model as one small file that `graings render` accepts in place of a run."""
-    model = open_model(run)
-    size = write_compact(model, output)
-    print_line(f"{output}: {size / 1e6:.2f} MB, {scene_bytes(model.scene) / 1e6:.2f} MB in float32.")
 
 
 @app.command()
@@ -270,17 +184,6 @@ def _package_command(entry: EntryPoint) -> Any:
         any_arguments = {"ignore_unknown_options": True, "allow_extra_args": True}
         group.command(entry.name, help=f"(not available: {reason})", context_settings=any_arguments)(unavailable)
     return typer.main.get_command(group)
-
-
-def _read_pose(file: Path) -> dict[str, object]:
-    """The values of a pose file. Raises `ValueError`."""
-    try:
-        pose = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file}: not JSON ({error})") from error
-    if not isinstance(pose, dict):
-        raise ValueError(f"{file}: must be a JSON object with world_to_camera, fx, width and height")
-    return pose
 
 
 def _fail(text: str, code: int) -> NoReturn:

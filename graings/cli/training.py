@@ -18,6 +18,7 @@ from graings.cli.interrupt import Interrupt
 from graings.cli.progress import TrainingProgress
 from graings.cli.terminal import busy_status, metrics_line, print_line
 from graings.config import PRESETS, make_config
+from graings.plan.rules import nothing_shown
 from graings.report.metrics_document import read_metrics
 from graings.training.run import TrainingRun
 
@@ -142,7 +143,8 @@ def _take_steps(run: TrainingRun) -> Interrupt:
         TrainingProgress(Console(), run.iteration, run.iterations) as progress,
         Interrupt("stopping after this step; press Ctrl-C again to stop at once") as interrupt,
     ):
-        for note in run.capture.notes:
+        seen = run.log.plan.statistics
+        for note in (*run.capture.notes, *(() if seen is None else nothing_shown(seen))):
             progress.note(note)
         for step in run:
             progress.show(step)

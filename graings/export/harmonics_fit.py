@@ -54,20 +54,20 @@ def fit_splats(
     chosen = [cameras[i] for i in spread(len(cameras), MAX_VIEWS)]
     views = [scene.compose(camera.center, time) for camera in chosen]
     children = torch.unique(torch.cat([view.children for view in views]))
-    opacities, geometry = torch.zeros(len(children)), [torch.zeros(len(children), width) for width in (3, 4, 3)]
+    opacities = torch.zeros(len(children))
+    means, quats, log_scales = (torch.zeros(len(children), width) for width in (3, 4, 3))
     colors, weights = torch.zeros(len(views), len(children), 3), torch.zeros(len(views), len(children))
     for index, (view, camera) in enumerate(zip(views, chosen, strict=True)):
         found, rows = view.gaussians, torch.searchsorted(children, view.children)
         colors[index, rows], weights[index, rows] = found.colors, contributions(view, camera)
         opacities[rows] += found.opacities / len(views)
-        for target, source in zip(geometry, (found.means, found.quats, found.log_scales), strict=True):
-            target[rows] = source
+        means[rows], quats[rows], log_scales[rows] = found.means, found.quats, found.log_scales
     eyes = torch.tensor([camera.center.tolist() for camera in chosen], dtype=torch.float64)
     highest = MAX_DEGREE if degree is None else degree
-    fits, errors = _least_squares(geometry[0].double(), eyes, colors, weights + _FLOOR, highest)
+    fits, errors = _least_squares(means.double(), eyes, colors, weights + _FLOOR, highest)
     if degree is None:
         degree = next(d for d in range(highest + 1) if errors[d] <= errors[highest] + _NEGLIGIBLE)
-    splats = Splats(*geometry, opacities, fits[degree].float(), views[0].blur, views[0].sampling)
+    splats = Splats(means, quats, log_scales, opacities, fits[degree].float(), views[0].blur, views[0].sampling)
     return HarmonicsFit(splats, children, weights.amax(0), tuple(errors[: highest + 1]))
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from graings.colmap import import_pycolmap
 from graings.document import read_document
 from graings.errors import CaptureError
 from graings.footage.frame_document import FootageFrames
@@ -135,8 +136,7 @@ def _frames(source: Path, workspace: Path, count: int, max_side: int, observe: O
 
 def _write_capture(model: pycolmap.Reconstruction, workspace: Path, target: Path, times: dict[str, float]) -> None:
     """Undistorted images, cameras and points. `transforms.json` comes last: with it the capture is complete."""
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     rotation = pycolmap.Rotation3d(upright(model))
     model.transform(pycolmap.Sim3d(1.0, rotation, np.zeros(3)))
     best, undistorted = workspace / "best", workspace / "undistorted"

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from graings.colmap import import_pycolmap
 from graings.errors import CaptureError
 
 if TYPE_CHECKING:
@@ -42,11 +43,10 @@ def reconstruct(
     `observe` is called with the phase, what is done of it and its total. Raises `CaptureError` without pycolmap.
     """
     try:
-        import pycolmap  # optional extra [colmap]
+        pycolmap = import_pycolmap()
     except ModuleNotFoundError as error:
         remedy = "Install it: pip install 'graings[colmap]'."
         raise CaptureError("finding the cameras needs the package pycolmap", file=images, remedy=remedy) from error
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     database = workspace / "database.db"
     _extract(database, images, names, threads, observe)
     _match(database, names, workspace / "pairs.txt", threads, observe)
@@ -58,8 +58,7 @@ def reconstruct(
     sparse.mkdir(exist_ok=True)
     models = pycolmap.global_mapping(database, images, sparse, options).values()
     observe("mapping", 1, 1)
-    best: pycolmap.Reconstruction | None = max(models, key=lambda model: model.num_reg_images(), default=None)
-    return best
+    return max(models, key=lambda model: int(model.num_reg_images()), default=None)
 
 
 def pairs(count: int) -> list[tuple[int, int]]:
@@ -70,8 +69,7 @@ def pairs(count: int) -> list[tuple[int, int]]:
 
 
 def _extract(database: Path, images: Path, names: Sequence[str], threads: int, observe: Observe) -> None:
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = threads
     options.sift.max_num_features = MAX_FEATURES
@@ -90,8 +88,7 @@ def _extract(database: Path, images: Path, names: Sequence[str], threads: int, o
 
 
 def _match(database: Path, names: Sequence[str], listing: Path, threads: int, observe: Observe) -> None:
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = threads
     chosen = pairs(len(names))

@@ -44,6 +44,16 @@ def decide(statistics: CaptureStatistics, config: TrainConfig) -> list[Decision]
     ]
 
 
+def nothing_shown(statistics: CaptureStatistics) -> list[str]:
+    """A warning where the training images have one colour; else none."""
+    if statistics.coverage > 0:
+        return []
+    return [
+        f"the {statistics.examined} training images that were looked at show one colour and nothing else: there is "
+        "nothing to learn, and every metric will be perfect."
+    ]
+
+
 def contradictions(statistics: CaptureStatistics, config: TrainConfig) -> tuple[str, ...]:
     """What the capture does not show, and options that contradict what was measured, with the number."""
     found = []
@@ -53,6 +63,7 @@ def contradictions(statistics: CaptureStatistics, config: TrainConfig) -> tuple[
         found.append(f"{MONOCULAR}. The deformation is kept.")
     if statistics.times > 1 and statistics.camera_motion == "fixed" and statistics.change is None:
         found.append("not every fixed camera could be looked at. The deformation is kept.")
+    found += nothing_shown(statistics)
     if config.scene.deformation == "none" and moves:
         found.append(f"scene.deformation is none, but {still}: what moves will be blurred.")
     found += [

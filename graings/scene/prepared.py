@@ -78,9 +78,13 @@ class PreparedScene:
         self._guard = threading.Lock()
 
     def with_basis(self, geometry: PreparedGeometry, residual: BasisResidual) -> PreparedScene:
-        """The same scene with another way of evaluating time; what does not depend on time is shared."""
+        """The same scene with another way of evaluating time; what does not depend on time is shared.
+
+        Exact geometry stays where that of the basis does not cost less, as that of quick motions may not.
+        """
         other = copy.copy(self)
-        other._geometry = geometry
+        if geometry.products < self._geometry.products:
+            other._geometry = geometry
         other._appearance = self._appearance.with_basis(residual)
         other._instants, other._guard = OrderedDict(), threading.Lock()
         return other
@@ -104,6 +108,11 @@ class PreparedScene:
     def slots(self) -> Int64[Tensor, " child"]:
         """Flat slots (anchor * k + child) of these children in the scene, ascending."""
         return self._candidates.children
+
+    @property
+    def products(self) -> float:
+        """What the geometry of each time costs: see `PreparedGeometry`."""
+        return self._geometry.products
 
     @property
     def uids(self) -> Int64[Tensor, " child"]:

@@ -36,6 +36,11 @@ class PreparedGeometry(ABC):
     def tensors(self) -> Iterable[Tensor]:
         """What is kept in memory."""
 
+    @property
+    @abstractmethod
+    def products(self) -> float:
+        """Numbers that each time multiplies by functions of time: what it costs."""
+
 
 def prepared_geometry(scene: Scene, slots: Int64[Tensor, " child"]) -> PreparedGeometry:
     """The geometry of the children `slots` (flat, ascending) of `scene`."""
@@ -60,6 +65,10 @@ class _Still(PreparedGeometry):
     def tensors(self) -> Iterable[Tensor]:
         return self._geometry
 
+    @property
+    def products(self) -> float:
+        return 0
+
 
 class _Evaluated(PreparedGeometry):
     """Networks with little or nothing that all times share: evaluated for the rendered children, as `Scene` does."""
@@ -72,6 +81,10 @@ class _Evaluated(PreparedGeometry):
 
     def tensors(self) -> Iterable[Tensor]:
         return (self._slots,)
+
+    @property
+    def products(self) -> float:
+        return math.inf  # whole networks
 
 
 def _evaluated(scene: Scene, slots: Tensor, time: float) -> Geometry:
@@ -98,6 +111,10 @@ class _Factorized(PreparedGeometry):
     def tensors(self) -> Iterable[Tensor]:
         return (*self._hidden, self._rest)
 
+    @property
+    def products(self) -> float:
+        return self._hidden.values.numel()
+
 
 class BasisGeometry(PreparedGeometry):
     """By a basis of functions of time, which describes offsets from the states `means`, `quats`, `log_scales`."""
@@ -120,6 +137,10 @@ class BasisGeometry(PreparedGeometry):
 
     def tensors(self) -> Iterable[Tensor]:
         return (*self._weights, self._rest, self._functions)
+
+    @property
+    def products(self) -> float:
+        return self._weights.values.numel()
 
 
 def unmoved(canonical: Float[Tensor, "child 7"], children: Children) -> Float[Tensor, "child 10"]:

@@ -38,7 +38,7 @@ class Composed:
     gaussians: Gaussians
     children: Int64[Tensor, " gaussian"]  # flat slot (anchor * k + child) of each Gaussian
     blur: float  # variance of the low-pass filter used in training, px^2 at the sampling rate `sampling`
-    sampling: SamplingRate
+    sampling: SamplingRate | None  # None: the filter has this width in the pixels of every image
 
 
 @dataclass(frozen=True, slots=True, eq=False)

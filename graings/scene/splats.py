@@ -7,7 +7,7 @@ camera centre to the centre of the Gaussian.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
@@ -31,7 +31,8 @@ class Splats:
     """N static Gaussians in normalised units, rows as in `Gaussians`.
 
     `harmonics` are the coefficients h_k of RGB, degree 0 first: 1, 4, 9 or 16 of them, else `ValueError` is raised.
-    `blur` is the variance of the low-pass filter in px^2 at the sampling rate `sampling`.
+    `blur` is the variance of the low-pass filter in px^2 at the sampling rate `sampling`; None: in every image, which
+    is the rule of 3DGS.
     """
 
     means: Float[Tensor, "gaussian 3"]
@@ -40,7 +41,7 @@ class Splats:
     opacities: Float[Tensor, " gaussian"]
     harmonics: Float[Tensor, "gaussian harmonic 3"]
     blur: float
-    sampling: SamplingRate
+    sampling: SamplingRate | None
 
     def __post_init__(self) -> None:
         if self.harmonics.ndim != 3 or self.harmonics.shape[1] not in {(d + 1) ** 2 for d in range(MAX_DEGREE + 1)}:
@@ -56,8 +57,8 @@ class Splats:
 
     def rows(self, kept: Tensor) -> Splats:
         """Those at the indices, or where the mask is true."""
-        parts = (self.means, self.quats, self.log_scales, self.opacities, self.harmonics)
-        return Splats(*(part[kept] for part in parts), self.blur, self.sampling)
+        names = ("means", "quats", "log_scales", "opacities", "harmonics")
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def compose(self, eye: ArrayLike, time: float) -> Composed:
         """The Gaussians seen from the camera centre `eye` [3]; the same at every `time`."""

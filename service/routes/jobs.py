@@ -6,12 +6,13 @@ from typing import Annotated
 from urllib.parse import urlencode
 
 from anyio import to_thread
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Header, Query, Request, Response
+from pydantic import HttpUrl
 
 from graings.config import PRESETS, make_config
-from jobs.job import ID_PATTERN, JobSpec
-from service.access import CallerDep
-from service.context import ContextDep, JobId
+from jobs.job import ID_PATTERN, CaptureNotFound, Job, JobSpec, JobState
+from service.access import Caller, CallerDep
+from service.context import Context, ContextDep, JobId
 from service.inspection import inspect_capture
 from service.problems import RESPONSES
 from service.schemas import JobPage, JobResource, job_resource, job_summary
@@ -21,8 +22,11 @@ router = APIRouter(prefix="/jobs", tags=["jobs"], responses=RESPONSES)
 
 RETRY_AFTER_S = "2"
 
+# Without a body where `capture` names one that was sent before.
+OPTIONAL_BODY = {"requestBody": {**CAPTURE_BODY["requestBody"], "required": False}}
 
-@router.post("", status_code=202, operation_id="submit_job", openapi_extra=CAPTURE_BODY)
+
+@router.post("", status_code=202, operation_id="submit_job", openapi_extra=OPTIONAL_BODY)
 async def submit(
     request: Request,
     response: Response,
@@ -34,19 +38,50 @@ async def submit(
     ] = None,
     priority: Annotated[int, Query(ge=1, le=1_000_000, description="Jobs with a lower number start first.")] = 10,
     name: Annotated[str, Query(min_length=1, max_length=120, description="Name of the job, for people.")] = "untitled",
+    webhook: Annotated[
+        HttpUrl | None, Query(description="Where to POST what happens to the job; signed with its `webhook_secret`.")
+    ] = None,
+    idempotency_key: Annotated[
+        str | None,
+        Header(max_length=255, description="Of the client's choice: the same request with it again makes no new job."),
+    ] = None,
+    capture: Annotated[
+        str | None,
+        Query(
+            pattern=r"^[0-9a-f]{64}$",
+            description="`capture` of one of your jobs, instead of a body: train on it again.",
+        ),
+    ] = None,
 ) -> JobResource:
     """Queue a training job on the capture in the body: an archive, or a multipart form with one as `capture`."""
     overrides = {} if config is None else parse_config(config, "config")
     # Checked before the body is read, so that a typing error is reported before gigabytes are uploaded.
-    make_config(preset, overrides)
+    again = make_config(preset, overrides)
+    webhook_address = None if webhook is None else str(webhook)
+    if capture is not None:
+        await to_thread.run_sync(_check_used, context, caller, capture)
+        await inspect_capture(context.store.capture(capture), again.capture)
+        spec = JobSpec(name, capture, again.model_dump(mode="json"), priority, caller.owner, webhook_address)
+        return _accepted(await to_thread.run_sync(context.jobs.submit, spec, None, idempotency_key), response)
     async with receive_capture(request, context.store.uploads, context.limits) as upload:
         chosen = make_config(preset, {**overrides, **upload.config})
         await inspect_capture(upload.folder, chosen.capture)
-        spec = JobSpec(name, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner)
-        job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder)
+        spec = JobSpec(name, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
+        job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder, idempotency_key)
+    return _accepted(job, response)
+
+
+def _accepted(job: Job, response: Response) -> JobResource:
     response.headers["Location"] = f"/jobs/{job.id}"
     response.headers["Retry-After"] = RETRY_AFTER_S
-    return job_resource(job)
+    return job_resource(job).model_copy(update={"webhook_secret": job.spec.webhook_secret})
+
+
+def _check_used(context: Context, caller: Caller, digest: str) -> None:
+    """Raise `CaptureNotFound` unless a job that the caller may see uses the capture `digest`."""
+    specs = ((job_id, context.jobs.spec(job_id)) for job_id in context.store.ids())
+    if not any(spec.capture == digest and caller.sees(job_id, spec) for job_id, spec in specs):
+        raise CaptureNotFound(digest)
 
 
 @router.get("", operation_id="list_jobs")
@@ -55,11 +90,18 @@ def page(
     caller: CallerDep,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[str | None, Query(pattern=ID_PATTERN, description="From `next` of the previous page.")] = None,
+    state: Annotated[list[JobState], Query(description="Only jobs in one of these states.")] = [],  # noqa: B006
+    name: Annotated[str | None, Query(max_length=120, description="Only jobs with this in their name.")] = None,
 ) -> JobPage:
     """Jobs, newest first."""
-    jobs, after = context.jobs.page(limit, cursor, wanted=caller.sees)
-    following = None if after is None else "/jobs?" + urlencode({"limit": limit, "cursor": after})
-    return JobPage(jobs=[job_summary(job) for job in jobs], next=following)
+    part = (name or "").casefold()
+
+    def wanted(job_id: str, spec: JobSpec) -> bool:
+        return part in spec.name.casefold() and caller.sees(job_id, spec)
+
+    jobs, after = context.jobs.page(limit, cursor, wanted=wanted, states=state)
+    following = {"limit": limit, "state": state, "name": name or [], "cursor": after}
+    return JobPage(jobs=[job_summary(job) for job in jobs], next=after and "/jobs?" + urlencode(following, doseq=True))
 
 
 @router.get("/{job_id}", operation_id="get_job")
@@ -87,6 +129,16 @@ def resume(job_id: JobId, context: ContextDep) -> JobResource:
 def retry(job_id: JobId, context: ContextDep) -> JobResource:
     """Queue a failed or diverged job again; it continues from its last checkpoint, if any."""
     return job_resource(context.jobs.retry(job_id))
+
+
+@router.post("/{job_id}/extend", status_code=202, operation_id="extend_job")
+def extend(
+    job_id: JobId,
+    context: ContextDep,
+    iterations: Annotated[int, Query(ge=1, le=1_000_000, description="How many more.")],
+) -> JobResource:
+    """Train a job that has succeeded for more iterations, from its last checkpoint; its model stays until then."""
+    return job_resource(context.jobs.extend(job_id, iterations))
 
 
 @router.delete("/{job_id}", status_code=204, operation_id="delete_job")

@@ -21,6 +21,7 @@ from graings.camera.camera import Camera
 from graings.camera.units import Units
 from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.errors import CheckpointError
+from graings.export.picture import Content, check_content
 from graings.image_encoding import FORMATS, MEDIA_TYPES, ImageFormat
 from graings.storage.model import Model
 from jobs.job import JobNotFound
@@ -97,6 +98,11 @@ class RenderQuery(BaseModel):
     width: int | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels; one alone keeps the aspect ratio.")
     height: int | None = Field(None, ge=1, le=MAX_SIDE, description="Pixels.")
     background: str | None = Field(None, max_length=60, description="white, black, #rrggbb or r,g,b in [0, 1].")
+    show: Content = Field(
+        "color",
+        description="color; rgba, transparent where nothing is; alpha; depth, in exr in the capture's units along the "
+        "viewing axis, else near white and far grey; layers, for exr: R, G, B, A and depth Z.",
+    )
     format: ImageFormat | None = Field(None, description="Instead of the Accept header.")
     fast: bool = Field(
         False,
@@ -118,11 +124,12 @@ async def render(
     job_id, loaded = await to_thread.run_sync(_model, context, caller, query.job)
     model = loaded.model
     try:
+        check_content(query.show, format)
         view = _view_request(query)
         camera, time, background = view.resolve(model.views, model.units, model.background)
     except ValueError as error:
         raise BadRequest(f"{error}.") from error
-    request = RenderRequest(camera, time, background, format, query.fast)
+    request = RenderRequest(camera, time, background, format, query.show, query.fast)
     headers = {
         "ETag": _etag(model, request),
         "Vary": "Accept",
@@ -241,6 +248,6 @@ def _etag(model: Model, request: RenderRequest) -> str:
         model.digest,
         camera.world_to_camera.tolist(),
         (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
-        (request.time, request.background, request.format, request.fast),
+        (request.time, request.background, request.format, request.content, request.fast),
     )
     return f'"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}"'

@@ -62,8 +62,9 @@ def begin_session(request: Request, response: Response, context: ContextDep, hea
 def end_session(response: Response, context: ContextDep, session: SessionDep) -> None:
     """Sign out: the session is refused from now on."""
     key = context.keys.find(session) if session else None
-    if key is not None:
-        context.keys.revoke(key)
+    if key is None:
+        raise Unauthorized(session is not None)
+    context.keys.revoke(key)
     response.delete_cookie(COOKIE)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -124,8 +125,10 @@ def test_a_fast_view_differs_by_what_is_printed(run: Path, tmp_path: Path, capsy
     printed = " ".join(capsys.readouterr().out.split())
     assert "px for 99 %" in printed
     found = psnr(pixels(tmp_path / "fast.exr"), pixels(tmp_path / "exact.exr"))
-    assert f"a PSNR of {found:.0f}" in printed.replace(f"{found:.1f}", f"{found:.0f}")
-    assert found > 40
+    said = re.search(r"PSNR of ([0-9.]+) dB", printed)
+    assert said is not None
+    assert float(said.group(1)) == pytest.approx(found, abs=0.1)
+    assert found > 35
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".exr"])

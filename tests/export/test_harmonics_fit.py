@@ -8,32 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from graings.camera.camera import Camera
 from graings.export.harmonics_fit import fit_splats
 from graings.render import PreparedScene, render
 from graings.scene.splats import Splats, harmonic_basis
 from tests.capture.captures import orbit
+from tests.export.models import SIZE, ring
 from tests.models import SAMPLING, tiny_scene
 
 WHITE = (1.0, 1.0, 1.0)
-SIZE = (40, 40)
-
-
-def ring(count: int) -> list[Camera]:
-    """Cameras around the origin, alternately above and below the equator."""
-    return [
-        Camera.orbit(
-            360.0 * index / count,
-            (-1) ** index * 60.0 * ((index * 0.618) % 1),
-            2.0,
-            target=(0.0, 0.0, 0.0),
-            up=(0.0, 0.0, 1.0),
-            fov=math.radians(50),
-            width=SIZE[0],
-            height=SIZE[1],
-        )
-        for index in range(count)
-    ]
 
 
 def psnr(a: Tensor, b: Tensor) -> float:

@@ -33,6 +33,10 @@ def until(condition: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
+def deliver(*_: object) -> None:
+    raise AssertionError("no message was sent")
+
+
 def state(engine: Engine, job_id: str) -> JobState:
     return engine.entries([job_id])[job_id].state
 
@@ -54,7 +58,7 @@ def test_jobs_run_by_priority_and_end_with_their_outcome(engine: Engine) -> None
     for job_id, priority in (("diverged", 30), ("failed", 20), ("broken", 15), ("succeeded", 10)):
         engine.enqueue(job_id, priority)
     assert engine.waiting() == 4
-    with executing(engine.url, "worker-a", 1, run):
+    with executing(engine.url, "worker-a", 1, run, deliver):
         until(lambda: engine.waiting() == 0 and not engine.running())
     assert order == ["succeeded", "broken", "failed", "diverged"]
     entries = engine.entries(order)
@@ -87,7 +91,7 @@ def test_a_job_can_be_cancelled_requeued_and_rewound_but_runs_under_its_own_limi
         return Outcome(JobState.FAILED, "on purpose")
 
     engine.enqueue("a", 10)
-    with executing(engine.url, "worker-a", 1, run):
+    with executing(engine.url, "worker-a", 1, run, deliver):
         until(lambda: running == ["a"])
         engine.enqueue("b", 10)
         engine.cancel("a")
@@ -117,11 +121,11 @@ def test_the_end_of_a_worker_stops_its_job_and_another_worker_can_take_it(engine
         return Outcome(JobState.SUCCEEDED)
 
     engine.enqueue("a", 10)
-    with executing(engine.url, "worker-a", 1, endless):
+    with executing(engine.url, "worker-a", 1, endless, deliver):
         assert began.wait(10)
     assert [(entry.job_id, entry.executor) for entry in engine.running()] == [("a", "worker-a")]
     engine.requeue(["a"])
-    with executing(engine.url, "worker-b", 1, brief):
+    with executing(engine.url, "worker-b", 1, brief, deliver):
         until(lambda: state(engine, "a") is JobState.SUCCEEDED)
 
 
@@ -143,7 +147,7 @@ def test_concurrent_retries_of_a_job_all_succeed(tmp_path: Path, engine: Engine)
     jobs = JobQueue(Store(tmp_path / "data"), engine)
     (tmp_path / "capture").mkdir()
     job_id = jobs.submit(JobSpec("a", "0" * 64, {}), tmp_path / "capture").id
-    with executing(engine.url, "worker-a", 1, run):
+    with executing(engine.url, "worker-a", 1, run, deliver):
         until(lambda: jobs.get(job_id).state is JobState.FAILED)
     together = threading.Barrier(8)
 

@@ -89,3 +89,21 @@ def test_a_training_that_diverges_ends_with_a_model_and_a_last_report(tmp_path: 
     reports, _ = read_progress(folder.progress, 0)
     kinds = [event.kind for _, report in reports for event in report.events]
     assert (kinds.count("rolled_back"), kinds.count("diverged"), kinds[-1]) == (3, 1, "diverged")
+
+
+def test_an_extended_job_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+    folder = job(Store(tmp_path), {"iterations": 12})
+    folder.begin_attempt("worker")
+    with trainer(folder) as process:
+        assert process.wait(60) == ExitCode.DONE
+    folder.write_spec(folder.spec().extended(10))
+    with trainer(folder) as process:
+        assert process.wait(60) == ExitCode.DONE
+    model, last = load_model(folder.run), last_progress(folder.progress)
+    assert last is not None
+    assert (model.iteration, model.finished, last.iteration, last.iterations) == (22, True, 22, 22)
+    reports = [report for _, report in read_progress(folder.progress, 0)[0]]
+    assert [report.iteration for report in reports if report.phase == "loading"] == [0, 12]
+    assert last.phase_s["loading"] > reports[0].phase_s.get("loading", 0.0)
+    assert set(last.phase_s) >= {"loading", last.phase}
+    assert json.loads(folder.metrics.read_text())["iterations"] == 22

@@ -162,6 +162,11 @@ def test_an_option_against_a_measurement_is_obeyed_and_warned_of(
     assert not plan.drops(kept) if kept != "nothing" else plan.drops("deformation")
 
 
+def test_images_of_one_colour_are_warned_of() -> None:
+    (warning,) = plan_of({"coverage": 0.0}).warnings
+    assert "show one colour and nothing else" in warning
+
+
 def test_no_warning_without_a_contradiction() -> None:
     assert plan_of().warnings == ()
     assert plan_of({"times": 1}).warnings == ()

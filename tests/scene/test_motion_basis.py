@@ -239,7 +239,7 @@ def test_fitting_no_children_gives_no_functions() -> None:
 @pytest.mark.parametrize("config", CONFIGS, ids=str)
 def test_the_fast_scene_shows_what_the_basis_says(config: dict[str, Any]) -> None:
     exact = PreparedScene(scene_of(config))
-    basis = MotionBasis.of(exact, VIEWS, pixels=0.2, levels=255.0)  # which also averages colours over views
+    basis = MotionBasis.of(exact, VIEWS, pixels=3.0, levels=25.0)
     fast, eye = basis.prepared(exact, view_levels=255.0), VIEWS[4].camera.center
     for time in (0.0, 0.31, 1.0):
         residual = basis.residual_at(time)
@@ -249,9 +249,10 @@ def test_the_fast_scene_shows_what_the_basis_says(config: dict[str, Any]) -> Non
             assert torch.equal(composed.children, basis.slots[shown])
         rows = torch.searchsorted(basis.slots, composed.children)
         gaussians = composed.gaussians
-        for found, expected in zip(
-            (gaussians.means, gaussians.quats, gaussians.log_scales), basis.geometry_at(time), strict=True
-        ):
+        everything = torch.arange(exact.children)
+        cheaper = fast.products < exact.products  # otherwise the exact geometry stays
+        geometry = basis.geometry_at(time) if cheaper else exact.geometry(time, everything)
+        for found, expected in zip((gaussians.means, gaussians.quats, gaussians.log_scales), geometry, strict=True):
             torch.testing.assert_close(found, expected[rows], rtol=1e-5, atol=1e-5)
         offset = residual[rows, 3] - basis.opacities[rows] + basis.opacity_offsets[rows]
         opacities = exact.canonical_opacities(eye)[rows] + offset
@@ -263,12 +264,13 @@ def test_the_fast_scene_shows_what_the_basis_says(config: dict[str, Any]) -> Non
 
 def test_the_fast_scene_in_float64() -> None:
     exact = PreparedScene(scene_of({}).double())
-    fast = MotionBasis.of(exact, VIEWS, pixels=0.01).prepared(exact)
+    fast = MotionBasis.of(exact, VIEWS, pixels=2.0).prepared(exact)
+    assert fast.products < exact.products
     found, expected = fast.compose(EYE, 0.31), exact.compose(EYE, 0.31)
     here = found.gaussians.means[torch.isin(found.children, expected.children)]
     there = expected.gaussians.means[torch.isin(expected.children, found.children)]
     assert here.dtype == torch.float64
-    torch.testing.assert_close(here, there, rtol=0, atol=1e-3)
+    assert float((here - there).norm(dim=1).max()) < 0.1
 
 
 def test_colours_of_the_residual_stay_exact_where_the_view_counts_more_than_the_bound() -> None:
@@ -287,13 +289,22 @@ def test_the_fast_image_is_as_near_as_its_bound_says() -> None:
     """To first order a shift by d px changes a pixel by at most 6.13 d of its contrast."""
     exact = PreparedScene(scene_of({}))
     psnrs = []
-    for pixels in (1.0, 0.1, 0.01):
-        fast = MotionBasis.of(exact, VIEWS, pixels=pixels, levels=2 * pixels).prepared(exact)
+    for pixels in (10.0, 1.0, 0.01):
+        fast = MotionBasis.of(exact, VIEWS, pixels=pixels, levels=10 * pixels).prepared(exact)
         images = [render(scene, VIEWS[3].camera, 0.41, (1.0, 1.0, 1.0)).color for scene in (fast, exact)]
         psnrs.append(psnr(*images))
         assert float((images[0] - images[1]).square().mean().sqrt()) < 6.13 * pixels
     assert psnrs[0] < psnrs[1] < psnrs[2]
     assert psnrs[2] > 55
+
+
+def test_the_fast_scene_never_costs_more() -> None:
+    exact = PreparedScene(scene_of({}))
+    rough, fine = (MotionBasis.of(exact, VIEWS, pixels=pixels).prepared(exact) for pixels in (3.0, 0.001))
+    assert rough.products < exact.products == fine.products
+    rows = torch.arange(exact.children)
+    assert torch.equal(fine.geometry(0.3, rows)[0], exact.geometry(0.3, rows)[0])
+    assert not torch.equal(rough.geometry(0.3, rows)[0], exact.geometry(0.3, rows)[0])
 
 
 def test_the_fast_scene_keeps_its_own_times() -> None:

@@ -11,15 +11,15 @@ import sys
 import time
 from pathlib import Path
 
-import httpx2
 import pytest
 
+from client import Client
 from tests.service.test_commands import LONG_S, readiness
 
 BRIEF = {"iterations": 12, "init.points": 200, "evaluation.views": 1}
 
 
-def test_a_job_is_uploaded_trained_and_rendered_over_http(tmp_path: Path, archive: bytes) -> None:
+def test_a_job_is_uploaded_trained_and_rendered_over_http(tmp_path: Path, capture: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -32,17 +32,14 @@ def test_a_job_is_uploaded_trained_and_rendered_over_http(tmp_path: Path, archiv
                 assert time.monotonic() < deadline
             (lease,) = (tmp_path / "workers").iterdir()
             worker = int(lease.stem.split("-")[-2])
-            with httpx2.Client(base_url=f"http://127.0.0.1:{port}", timeout=LONG_S) as client:
-                query = {"preset": "draft", "config": json.dumps(BRIEF)}
-                job = client.post("/jobs", params=query, content=archive).raise_for_status().json()
-                while job["state"] in ("queued", "running"):
-                    assert time.monotonic() < deadline
-                    time.sleep(0.1)
-                    job = client.get(job["links"]["self"]).json()
-                assert (job["state"], job["error"], job["checkpoint"]) == ("succeeded", None, 12)
-                assert client.get(job["links"]["metrics"]).json()["iterations"] == 12
-                image = client.get(job["links"]["render"], params={"camera": "val:0"})
-                assert (image.status_code, image.content[:4]) == (200, b"\x89PNG")
+            with Client(f"http://127.0.0.1:{port}") as client:
+                job = client.wait(client.submit(capture, preset="draft", config=BRIEF).id)
+                assert (job.state, job.error, job.checkpoint) == ("succeeded", None, 12)
+                metrics = client.download(job.id, "metrics", tmp_path / "metrics.json")
+                assert json.loads(metrics.read_text())["iterations"] == 12
+                assert client.render(job.id, camera="val:0", format="png")[:4] == b"\x89PNG"
+                job = client.wait(client.extend(job.id, 6).id)
+                assert (job.state, job.error, job.checkpoint) == ("succeeded", None, 18)
             process.send_signal(signal.SIGTERM)
             assert process.wait(LONG_S) == 0
             with pytest.raises(ProcessLookupError):  # it took its worker along

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
@@ -16,7 +17,7 @@ from jobs.engine import Engine
 from jobs.store import JobFolder
 from service.app import create_app
 from service.settings import Settings
-from tests.capture.captures import write_single
+from tests.capture.captures import write_image, write_single
 
 
 def problem(answer: Any, status: int) -> dict[str, Any]:
@@ -56,6 +57,7 @@ def test_a_lone_transforms_file_with_its_points_becomes_a_job(client: TestClient
     folder = write_single(
         tmp_path / "scan", 10, ply_file_path="points.ply", k1=0.01, frame={"mask_path": "masks/0.png"}
     )
+    write_image(folder / "masks/0.png", np.full((40, 64, 1), 255, np.uint8))
     place = "".join(f"property float {axis}\n" for axis in "xyz")
     header = f"ply\nformat ascii 1.0\nelement vertex 2\n{place}end_header\n"
     (folder / "points.ply").write_text(header + "0 0 0\n0.1 0 0\n")
@@ -121,14 +123,14 @@ def repacked(archive: bytes, change: Callable[[str, bytes], bytes | None]) -> by
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        (lambda name, content: None if name.endswith("train/r_000.png") else content, "train/r_000"),
+        (lambda name, content: None if "train/r_0" in name else content, "train/r_000"),
         (
             lambda name, content: content.replace(b"camera_angle_x", b"angle") if "json" in name else content,
             "transforms",
         ),
         (lambda name, content: content if name.endswith("r_000.png") else None, "the archive"),
     ],
-    ids=["an image is missing", "a camera is missing", "only images"],
+    ids=["images are missing", "a camera is missing", "only images"],
 )
 def test_a_capture_that_cannot_be_trained_on_is_refused_at_once(
     client: TestClient, archive: bytes, settings: Settings, change: Callable[[str, bytes], bytes | None], word: str
@@ -239,3 +241,29 @@ def test_a_job_stored_but_not_queued_is_queued_at_the_next_start(settings: Setti
     with TestClient(create_app(settings)):
         assert engine.waiting() == 1
     engine.close()
+
+
+def test_a_capture_that_a_job_uses_is_trained_on_again_without_sending_it(
+    client: TestClient, job: str, settings: Settings
+) -> None:
+    digest = client.get(f"/jobs/{job}").json()["capture"]
+    answer = client.post("/jobs", params={"capture": digest, "preset": "draft", "name": "again"})
+    assert answer.status_code == 202, answer.text
+    again = answer.json()
+    assert (again["capture"], again["name"], again["state"]) == (digest, "again", "queued")
+    assert answer.headers["location"] == f"/jobs/{again['id']}"
+    assert [path.name for path in (settings.data / "captures").iterdir()] == [digest]
+    assert client.delete(f"/jobs/{job}").status_code in (204, 409)
+
+
+def test_an_unknown_capture_is_not_found_and_leaves_no_job(client: TestClient, job: str) -> None:
+    detail = problem(client.post("/jobs", params={"capture": "0" * 64}), 404)
+    assert "Send it again" in detail["detail"]
+    assert problem(client.post("/jobs", params={"capture": "../jobs"}), 422)
+    assert [each["id"] for each in client.get("/jobs").json()["jobs"]] == [job]
+
+
+def test_options_for_a_capture_that_was_sent_before_are_checked(client: TestClient, job: str) -> None:
+    digest = client.get(f"/jobs/{job}").json()["capture"]
+    params = {"capture": digest, "config": json.dumps({"capture.nothing": 1})}
+    problem(client.post("/jobs", params=params), 422)

@@ -21,8 +21,9 @@ from graings.errors import DivergedError
 from graings.raster.rasterize import rasterize
 from graings.render import draw, render
 from graings.report.events import Event
+from graings.scene.memory import bytes_per_anchor
 from graings.storage.checkpoint import load_model
-from graings.training.density.budget import affordable_anchors, bytes_per_anchor
+from graings.training.density.budget import affordable_anchors
 from graings.training.density.growth import MIN_ANCHORS
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer

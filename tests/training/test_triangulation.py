@@ -13,8 +13,9 @@ from graings.camera.camera import Camera
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig
+from graings.matching.rays import ray_intersections
 from graings.training.initialization import triangulation
-from graings.training.initialization.triangulation import fill_untextured, ray_intersections, tracks, triangulate
+from graings.training.initialization.triangulation import fill_untextured, tracks, triangulate
 from tests.capture.captures import FOV, entry, write_image, write_transforms, write_walled
 
 DISTANCE = 4.0

@@ -23,10 +23,7 @@ class Foreign:
 
 
 _PROCESS: Final = "convert it with nerfstudio's `ns-process-data {}` and give its output"
-_SFM: Final = (
-    "find the cameras with COLMAP (`colmap automatic_reconstructor --workspace_path . --image_path images`) and give "
-    "the folder with sparse/ and images/; graings needs known cameras"
-)
+_FOOTAGE: Final = "find the cameras first: `graings capture {} -o CAPTURE`, then give that folder"
 
 FORMATS: Final = (
     Foreign(("opensfm/reconstruction.json", "odm_*", "images.json"), "OpenDroneMap", _PROCESS.format("odm")),
@@ -44,11 +41,11 @@ FORMATS: Final = (
     Foreign(
         ("point_cloud/iteration_*",), "a trained 3D Gaussian Splatting model", "give the capture it was trained on"
     ),
-    Foreign(tuple(f"*{suffix}" for suffix in VIDEO_SUFFIXES), "video without cameras", f"extract frames, then {_SFM}"),
+    Foreign(tuple(f"*{suffix}" for suffix in VIDEO_SUFFIXES), "video without cameras", _FOOTAGE.format("VIDEO")),
     Foreign(
         tuple(f"{place}*{suffix}" for place in ("", "images/", "*/") for suffix in (*SUFFIXES, *UNREADABLE_SUFFIXES)),
         "pictures without cameras",
-        _SFM,
+        _FOOTAGE.format("FOLDER"),
     ),
 )
 

@@ -1,12 +1,11 @@
 """The command `demo`: train a synthetic moving scene over HTTP and fetch views of it.
 
-It starts the service and a worker as `graings serve --with-worker` does, draws the synthetic capture, submits it,
-shows the progress of training, and fetches views and metrics. It uses the REST interface like any other client.
+It draws the capture and starts the service by their commands, and is then a client like any other: it submits the
+capture, shows the progress of training, and fetches views and metrics.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 import signal
@@ -15,23 +14,18 @@ import subprocess
 import sys
 import threading
 import time
-import urllib.error
-import urllib.request
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import urlencode
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from graings.capture.synthetic import synthesize
-from graings.kernel.threads import usable_cores
-from jobs.job import JobState
+from client import Client, ClientError, Event
+
+GRAINGS = [sys.executable, "-m", "graings"]
 
 # About a minute of training on two cores.
 PRESET = "draft"
@@ -48,28 +42,6 @@ VIEWPOINTS: dict[str, dict[str, object]] = {
 }
 PREFERRED_PORT = 8000
 START_S = 60.0
-POLL_S = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Api:
-    """A minimal REST client. `url` has no slash at its end."""
-
-    url: str
-
-    def fetch(self, path: str, body: bytes | None = None, kind: str = "application/json") -> bytes:
-        """The body of the response to a POST of `body`, or to a GET without a body. Raises `DemoError`."""
-        request = urllib.request.Request(self.url + path, data=body, headers={"Content-Type": kind})
-        try:
-            with urllib.request.urlopen(request, timeout=120) as response:
-                content: bytes = response.read()
-                return content
-        except urllib.error.HTTPError as error:
-            problem = json.loads(error.read())
-            raise DemoError(f"{path}: {problem.get('detail') or problem['title']}") from error
-
-    def json(self, path: str, body: bytes | None = None, kind: str = "application/json") -> Any:
-        return json.loads(self.fetch(path, body, kind))
 
 
 class DemoError(Exception):
@@ -86,34 +58,31 @@ def demo(
     serving = False
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with _service(folder / "service", folder / "service.log") as api:
-            job = _train(api, folder, console)
-            metrics = _fetch(api, job, folder, console)
+        with _service(folder / "service", folder / "service.log") as (url, client):
+            job = _train(url, client, folder, console)
+            metrics = _fetch(client, job, folder, console)
             console.print(f"Held-out PSNR [bold]{metrics['splits']['val']['psnr']:.2f} dB[/] (validation views)")
             console.print(f"Total time {time.monotonic() - started:.0f} s.")
             if not once:
-                console.print(
-                    f"Serving at [bold]{api.url}[/] — drag to orbit, move the time slider. Press Ctrl-C to stop."
-                )
+                console.print(f"Serving at [bold]{url}[/] — drag to orbit, move the time slider. Press Ctrl-C to stop.")
                 serving = True
                 threading.Event().wait()
     except KeyboardInterrupt:
         # The child processes have ended. It is a failure only if the views are not written yet.
         raise typer.Exit(0 if serving else 130) from None
-    except DemoError as error:
+    except (DemoError, ClientError) as error:
         console.print(f"[red]demo:[/] {error}")
         raise typer.Exit(1) from error
 
 
-def _train(api: Api, folder: Path, console: Console) -> str:
+def _train(url: str, client: Client, folder: Path, console: Console) -> str:
     """Submit the capture and wait for the end of the job; returns its id."""
     capture = folder / SCENE
     if not capture.exists():
-        _draw_capture(capture, console)
+        _draw_capture(capture)
     console.print(f"Capture: {capture} ({VIEWS} training images of {SIZE} px)")
-    query = urlencode({"preset": PRESET, "name": SCENE, "config": json.dumps(OPTIONS)})
-    job = api.json(f"/jobs?{query}", _zipped(capture), "application/zip")
-    console.print(f"Job:     {api.url}{job['links']['self']}")
+    job = client.submit(capture, preset=PRESET, config=OPTIONS)
+    console.print(f"Job:     {url}/jobs/{job.id}")
     columns = (
         TextColumn("{task.fields[phase]:>8}"),
         BarColumn(),
@@ -123,80 +92,71 @@ def _train(api: Api, folder: Path, console: Console) -> str:
     )
     with Progress(*columns, console=console) as progress:
         bar = progress.add_task("train", total=OPTIONS["iterations"], phase="waiting", details="")
-        while not JobState(job["state"]).final:
-            time.sleep(POLL_S)
-            job = api.json(job["links"]["self"])
-            report = job["progress"]
-            if report:
-                details = ""
+
+        def show(event: Event) -> None:
+            if event.kind == "progress":
+                report, details = event.data, ""
                 if report["psnr"] is not None:
                     details = f"{report['psnr']:.1f} dB · {report['gaussians']} Gaussians"
                 progress.update(bar, completed=report["iteration"], phase=report["phase"], details=details)
-    if job["state"] != JobState.SUCCEEDED:
-        raise DemoError(f"the job has {job['state']}: {job['error']}. Its log: {api.url}{job['links']['log']}")
-    return str(job["id"])
+
+        job = client.wait(job.id, show)
+    if job.state != "succeeded":
+        raise DemoError(f"the job has {job.state}: {job.error}. Its log: {url}/jobs/{job.id}/log")
+    return job.id
 
 
-def _draw_capture(capture: Path, console: Console) -> None:
+def _draw_capture(capture: Path) -> None:
     part = capture.with_suffix(".part")  # renamed when complete, so that a partial capture is not used
     shutil.rmtree(part, ignore_errors=True)
-    columns = (TextColumn("    draw"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as progress:
-        bar = progress.add_task("draw", total=None)
-        synthesize(
-            SCENE,
-            part,
-            size=SIZE,
-            views=VIEWS,
-            processes=usable_cores(),
-            observe=lambda done, total: progress.update(bar, completed=done, total=total),
-        )
+    command = [*GRAINGS, "synthesize", SCENE, "-o", str(part), "--size", str(SIZE), "--views", str(VIEWS)]
+    if subprocess.run(command).returncode != 0:
+        raise DemoError("the synthetic capture could not be drawn")
     part.rename(capture)
 
 
-def _fetch(api: Api, job: str, folder: Path, console: Console) -> dict[str, Any]:
+def _fetch(client: Client, job: str, folder: Path, console: Console) -> dict[str, Any]:
     """Fetch views from several viewpoints and times, and the metrics, into `folder`. Returns the metrics."""
     views = folder / "views"
     views.mkdir(parents=True, exist_ok=True)
     for name, viewpoint in VIEWPOINTS.items():
         for t in TIMES:
-            image = api.fetch("/render?" + urlencode({"job": job, "t": t, "format": "png", **viewpoint}))
-            (views / f"{name}_t{t:.2f}.png").write_bytes(image)
-    metrics: dict[str, Any] = api.json(f"/jobs/{job}/metrics")
-    (folder / "metrics.json").write_text(json.dumps(metrics, indent=1))
-    (folder / "curve.svg").write_bytes(api.fetch(f"/jobs/{job}/curve.svg"))
+            client.render(job, views / f"{name}_t{t:.2f}.png", t=t, **viewpoint)
+    metrics: dict[str, Any] = json.loads(client.download(job, "metrics", folder / "metrics.json").read_text())
+    client.download(job, "curve.svg", folder / "curve.svg")
     console.print(f"Views:   {views} ({len(VIEWPOINTS) * len(TIMES)} files)")
     console.print(f"Metrics: {folder / 'metrics.json'}, {folder / 'curve.svg'}")
     return metrics
 
 
 @contextmanager
-def _service(data: Path, log: Path) -> Iterator[Api]:
-    """Service and worker as child processes, which end with the context."""
+def _service(data: Path, log: Path) -> Iterator[tuple[str, Client]]:
+    """Service and worker as child processes, which end with the context; the address and a client of it."""
     data.mkdir(parents=True, exist_ok=True)
     port = _free_port()
-    command = [sys.executable, "-m", "service.commands", "--with-worker", "--exit-with-parent"]
+    command = [*GRAINGS, "serve", "--with-worker", "--exit-with-parent"]
     command += ["--data", str(data), "--port", str(port)]
     with log.open("ab") as output:
         # In its own session: a Ctrl-C reaches only this process, which then stops the children.
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=output, start_new_session=True)
+    url = f"http://127.0.0.1:{port}"
     try:
-        api = Api(f"http://127.0.0.1:{port}")
-        _wait_until_ready(api, child, log)
-        yield api
+        with Client(url) as client:
+            _wait_until_ready(client, child, log)
+            yield url, client
     finally:
         child.terminate()
         child.wait()
 
 
-def _wait_until_ready(api: Api, child: subprocess.Popen[bytes], log: Path) -> None:
+def _wait_until_ready(client: Client, child: subprocess.Popen[bytes], log: Path) -> None:
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline:
         if child.poll() is not None:
             raise DemoError(f"the service ended with code {child.returncode}; see {log}")
         try:
-            api.json("/readyz")
-        except OSError:
+            client.readiness()
+        except ClientError:
             time.sleep(0.2)  # not listening yet
         else:
             return
@@ -213,13 +173,3 @@ def _free_port() -> int:
                 continue
             return int(probe.getsockname()[1])
     raise DemoError("no port is free")
-
-
-def _zipped(folder: Path) -> bytes:
-    memory = io.BytesIO()
-    # Images are compressed already.
-    with zipfile.ZipFile(memory, "w", zipfile.ZIP_STORED) as archive:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                archive.write(path, path.relative_to(folder))
-    return memory.getvalue()

@@ -1,0 +1,148 @@
+"""AsyncClient: the service for programs that do something else meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import uuid
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx2
+
+from client import calls
+from client.answers import ClientError, Event, RemoteJob
+from client.captures import Observe, chunks, packed
+
+T = TypeVar("T")
+
+
+class AsyncClient:
+    """`client.Client` with the same methods to await, and iterators for `async for`. Runs on asyncio."""
+
+    def __init__(self, url: str = "http://127.0.0.1:8000", key: str | None = None, **options: Any) -> None:
+        self._http = httpx2.AsyncClient(**calls.settings(url, key) | options)
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        await self._http.aclose()
+
+    async def submit(
+        self,
+        capture: Path | str,
+        *,
+        preset: str = "standard",
+        config: calls.Query | None = None,
+        name: str | None = None,
+        priority: int = 10,
+        observe: Observe | None = None,
+    ) -> RemoteJob:
+        """Train on a capture: a folder, or a zip, tar or tar.gz of one. `observe` gets the bytes sent and all."""
+        call = calls.submit(name or Path(capture).stem, preset, config, priority, uuid.uuid4().hex)
+        with ExitStack() as stack:
+            archive = await asyncio.to_thread(stack.enter_context, packed(capture))
+            return await self._do(call, chunks(archive, observe))
+
+    async def job(self, job_id: str) -> RemoteJob:
+        return await self._do(calls.job(job_id))
+
+    async def jobs(self, **filters: Any) -> AsyncIterator[RemoteJob]:
+        """All jobs, newest first, without their options. `filters` are the parameters of `GET /jobs`."""
+        path: str | None = f"/jobs?{httpx2.QueryParams(filters)}"
+        while path is not None:
+            jobs, path = await self._do(calls.page(path))
+            for job in jobs:
+                yield job
+
+    async def events(self, job_id: str, after: str | None = None) -> AsyncIterator[Event]:
+        """What happens to a job, until it has ended; a broken connection is opened again where it broke."""
+        heard = time.monotonic()
+        while True:
+            headers = {} if after is None else {"Last-Event-ID": after}
+            try:
+                async with self._http.sse(f"/jobs/{job_id}/events", headers=headers) as stream:
+                    if not stream.response.is_success:
+                        await stream.response.aread()
+                        calls.read(stream.response, lambda response: None)
+                    async for event in stream:
+                        after, heard = event.id or after, time.monotonic()
+                        yield Event(event.event, event.json())  # type: ignore[arg-type]
+                        if event.event == "end":
+                            return
+            except httpx2.TransportError as error:
+                if time.monotonic() - heard > calls.PATIENCE_S:
+                    raise ClientError(calls.no_answer(self._http.base_url, error)) from error
+            await asyncio.sleep(calls.RECONNECT_S)
+
+    async def wait(self, job_id: str, observe: Callable[[Event], None] | None = None) -> RemoteJob:
+        """The job, when it has ended; `observe` gets every event meanwhile."""
+        async for event in self.events(job_id):
+            if observe is not None:
+                observe(event)
+        return await self.job(job_id)
+
+    async def render(self, job_id: str | None = None, path: Path | str | None = None, **view: Any) -> bytes:
+        """An image of a job, or of the newest model; also written to `path`.
+
+        `view` are the parameters of `GET /render`, such as t=0.3, azimuth=90, width=800, format="png"; `pose` may be a
+        4x4 array and `target` three numbers.
+        """
+        content = await self._do(calls.render(job_id, calls.with_format(view, path)))
+        if path is not None:
+            calls.save(content, path)
+        return content
+
+    async def render_array(self, job_id: str | None = None, **view: Any) -> Any:
+        """As `render`, as a uint8 array, height x width x 3. Needs numpy and Pillow."""
+        return calls.image_array(await self._do(calls.render(job_id, {**view, "format": "png"})))
+
+    async def download(self, job_id: str, result: str, path: Path | str) -> Path:
+        """Write a result to a file: model, metrics, plan, report, log, curve.svg or report.svg."""
+        return calls.save(await self._do(calls.result(job_id, result)), path)
+
+    async def cancel(self, job_id: str) -> RemoteJob:
+        return await self._do(calls.change(job_id, "cancel"))
+
+    async def resume(self, job_id: str) -> RemoteJob:
+        return await self._do(calls.change(job_id, "resume"))
+
+    async def retry(self, job_id: str) -> RemoteJob:
+        return await self._do(calls.change(job_id, "retry"))
+
+    async def extend(self, job_id: str, iterations: int) -> RemoteJob:
+        """Train a job that has succeeded for so many more iterations."""
+        return await self._do(calls.extend(job_id, iterations))
+
+    async def delete(self, job_id: str) -> None:
+        await self._do(calls.delete(job_id))
+
+    async def readiness(self) -> dict[str, Any]:
+        return await self._do(calls.readiness())
+
+    async def _do(self, call: calls.Call[T], content: Iterator[bytes] | None = None) -> T:
+        for attempt in range(calls.ATTEMPTS):
+            body = None if content is None else _awaited(content)
+            try:
+                response = await self._http.request(
+                    call.method, call.path, params=call.query or None, headers=call.headers, content=body
+                )
+            except httpx2.TransportError as error:
+                raise ClientError(calls.no_answer(self._http.base_url, error)) from error
+            pause = None if content is not None else calls.pause(response, attempt)
+            if pause is None:
+                return calls.read(response, call.read)
+            await asyncio.sleep(pause)
+        raise AssertionError("unreachable: the last attempt has no pause")
+
+
+async def _awaited(content: Iterator[bytes]) -> AsyncIterator[bytes]:
+    """The chunks of a file, read in another thread."""
+    while (chunk := await asyncio.to_thread(next, content, None)) is not None:
+        yield chunk

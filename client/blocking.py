@@ -1,0 +1,141 @@
+"""Client: the service for programs that wait for each answer."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx2
+
+from client import calls
+from client.answers import ClientError, Event, RemoteJob
+from client.captures import Observe, chunks, packed
+
+T = TypeVar("T")
+
+
+class Client:
+    """A client of the service at `url`. Every method raises `RefusedError` if the service refuses.
+
+    `key` is what `graings keys create` has shown; a service on this machine may need none. A `ClientError` says that
+    the service does not answer.
+    """
+
+    def __init__(self, url: str = "http://127.0.0.1:8000", key: str | None = None, **options: Any) -> None:
+        self._http = httpx2.Client(**calls.settings(url, key) | options)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._http.close()
+
+    def submit(
+        self,
+        capture: Path | str,
+        *,
+        preset: str = "standard",
+        config: calls.Query | None = None,
+        name: str | None = None,
+        priority: int = 10,
+        observe: Observe | None = None,
+    ) -> RemoteJob:
+        """Train on a capture: a folder, or a zip, tar or tar.gz of one. `observe` gets the bytes sent and all."""
+        call = calls.submit(name or Path(capture).stem, preset, config, priority, uuid.uuid4().hex)
+        with packed(capture) as archive:
+            return self._do(call, chunks(archive, observe))
+
+    def job(self, job_id: str) -> RemoteJob:
+        return self._do(calls.job(job_id))
+
+    def jobs(self, **filters: Any) -> Iterator[RemoteJob]:
+        """All jobs, newest first, without their options. `filters` are the parameters of `GET /jobs`."""
+        path: str | None = f"/jobs?{httpx2.QueryParams(filters)}"
+        while path is not None:
+            jobs, path = self._do(calls.page(path))
+            yield from jobs
+
+    def events(self, job_id: str, after: str | None = None) -> Iterator[Event]:
+        """What happens to a job, until it has ended; a broken connection is opened again where it broke."""
+        heard = time.monotonic()
+        while True:
+            headers = {} if after is None else {"Last-Event-ID": after}
+            try:
+                with self._http.sse(f"/jobs/{job_id}/events", headers=headers) as stream:
+                    if not stream.response.is_success:
+                        stream.response.read()
+                        calls.read(stream.response, lambda response: None)
+                    for event in stream:
+                        after, heard = event.id or after, time.monotonic()
+                        yield Event(event.event, event.json())  # type: ignore[arg-type]
+                        if event.event == "end":
+                            return
+            except httpx2.TransportError as error:
+                if time.monotonic() - heard > calls.PATIENCE_S:
+                    raise ClientError(calls.no_answer(self._http.base_url, error)) from error
+            time.sleep(calls.RECONNECT_S)
+
+    def wait(self, job_id: str, observe: Callable[[Event], None] | None = None) -> RemoteJob:
+        """The job, when it has ended; `observe` gets every event meanwhile."""
+        for event in self.events(job_id):
+            if observe is not None:
+                observe(event)
+        return self.job(job_id)
+
+    def render(self, job_id: str | None = None, path: Path | str | None = None, **view: Any) -> bytes:
+        """An image of a job, or of the newest model; also written to `path`.
+
+        `view` are the parameters of `GET /render`, such as t=0.3, azimuth=90, width=800, format="png"; `pose` may be a
+        4x4 array and `target` three numbers.
+        """
+        content = self._do(calls.render(job_id, calls.with_format(view, path)))
+        if path is not None:
+            calls.save(content, path)
+        return content
+
+    def render_array(self, job_id: str | None = None, **view: Any) -> Any:
+        """As `render`, as a uint8 array, height x width x 3. Needs numpy and Pillow."""
+        return calls.image_array(self._do(calls.render(job_id, {**view, "format": "png"})))
+
+    def download(self, job_id: str, result: str, path: Path | str) -> Path:
+        """Write a result to a file: model, metrics, plan, report, log, curve.svg or report.svg."""
+        return calls.save(self._do(calls.result(job_id, result)), path)
+
+    def cancel(self, job_id: str) -> RemoteJob:
+        return self._do(calls.change(job_id, "cancel"))
+
+    def resume(self, job_id: str) -> RemoteJob:
+        return self._do(calls.change(job_id, "resume"))
+
+    def retry(self, job_id: str) -> RemoteJob:
+        return self._do(calls.change(job_id, "retry"))
+
+    def extend(self, job_id: str, iterations: int) -> RemoteJob:
+        """Train a job that has succeeded for so many more iterations."""
+        return self._do(calls.extend(job_id, iterations))
+
+    def delete(self, job_id: str) -> None:
+        self._do(calls.delete(job_id))
+
+    def readiness(self) -> dict[str, Any]:
+        return self._do(calls.readiness())
+
+    def _do(self, call: calls.Call[T], content: Iterator[bytes] | None = None) -> T:
+        for attempt in range(calls.ATTEMPTS):
+            try:
+                response = self._http.request(
+                    call.method, call.path, params=call.query or None, headers=call.headers, content=content
+                )
+            except httpx2.TransportError as error:
+                raise ClientError(calls.no_answer(self._http.base_url, error)) from error
+            pause = None if content is not None else calls.pause(response, attempt)
+            if pause is None:
+                return calls.read(response, call.read)
+            time.sleep(pause)
+        raise AssertionError("unreachable: the last attempt has no pause")

@@ -1,0 +1,158 @@
+"""Calls: each request of the service, with how to read its answer. Both clients send them."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import httpx2
+
+from client.answers import ClientError, RefusedError, RemoteJob
+
+T = TypeVar("T")
+Query = Mapping[str, Any]
+
+TIMEOUT = httpx2.Timeout(120.0, connect=10.0)  # an image of a large scene, or the inspection of a large capture
+RECONNECT_S = 1.0
+PATIENCE_S = 60.0  # a service that restarts is back sooner
+ATTEMPTS = 6
+RESULTS = ("model", "metrics", "plan", "report", "log", "curve.svg", "report.svg")
+
+
+@dataclass(frozen=True, slots=True)
+class Call(Generic[T]):
+    """A request, and the function that reads its answer."""
+
+    method: str
+    path: str
+    read: Callable[[httpx2.Response], T]
+    query: Query = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+def settings(url: str, key: str | None) -> dict[str, Any]:
+    """How both clients connect."""
+    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+    return {"base_url": url, "headers": headers, "timeout": TIMEOUT}
+
+
+def read(response: httpx2.Response, how: Callable[[httpx2.Response], T]) -> T:
+    """The answer of the service. Raises `RefusedError`."""
+    if response.is_success:
+        return how(response)
+    try:
+        problem = response.json()
+    except ValueError:  # from a proxy in between
+        problem = {}
+    raise RefusedError(response.status_code, problem if isinstance(problem, dict) else {})
+
+
+def pause(response: httpx2.Response, attempt: int) -> float | None:
+    """Seconds after which a busy service may be asked again; None if the answer counts."""
+    wait = response.headers.get("retry-after", "")
+    if response.status_code not in (429, 503) or not wait.isdigit() or attempt + 1 == ATTEMPTS:
+        return None
+    return float(wait)
+
+
+def no_answer(url: httpx2.URL, error: Exception) -> str:
+    """What to say when the service does not answer."""
+    return f"{url} does not answer: {error or type(error).__name__}. Is the service running there?"
+
+
+def submit(name: str, preset: str, config: Query | None, priority: int, key: str) -> Call[RemoteJob]:
+    query = {"name": name, "preset": preset, "priority": priority, "config": json.dumps(dict(config or {}))}
+    headers = {"Content-Type": "application/octet-stream", "Idempotency-Key": key}
+    return Call("POST", "/jobs", _job, query, headers)
+
+
+def job(job_id: str) -> Call[RemoteJob]:
+    return Call("GET", f"/jobs/{job_id}", _job)
+
+
+def change(job_id: str, verb: str) -> Call[RemoteJob]:
+    return Call("POST", f"/jobs/{job_id}/{verb}", _job)
+
+
+def extend(job_id: str, iterations: int) -> Call[RemoteJob]:
+    return Call("POST", f"/jobs/{job_id}/extend", _job, {"iterations": iterations})
+
+
+def delete(job_id: str) -> Call[None]:
+    return Call("DELETE", f"/jobs/{job_id}", lambda response: None)
+
+
+def page(path: str) -> Call[tuple[list[RemoteJob], str | None]]:
+    """One page of the list: its jobs without their options, and the path of the next page."""
+    return Call("GET", path, _page)
+
+
+def render(job_id: str | None, query: Query) -> Call[bytes]:
+    """The parameters of an image; lists become JSON for `pose` and numbers with commas for `target`."""
+    given = {name: _text(name, value) for name, value in query.items() if value is not None}
+    return Call("GET", "/render", _content, given if job_id is None else {"job": job_id, **given})
+
+
+def with_format(view: Query, path: Path | str | None) -> Query:
+    """The format that the name of a file asks for, unless `view` has one."""
+    suffix = "" if path is None else Path(path).suffix.lower().removeprefix(".")
+    return {"format": {"jpg": "jpeg"}.get(suffix, suffix) or None, **view}
+
+
+def result(job_id: str, name: str) -> Call[bytes]:
+    """A file of a job, one of `RESULTS`."""
+    if name not in RESULTS:
+        raise ClientError(f"There is no result {name!r}. Choose one of {', '.join(RESULTS)}.")
+    return Call("GET", f"/jobs/{job_id}/{name}", _content)
+
+
+def readiness() -> Call[dict[str, Any]]:
+    return Call("GET", "/readyz", _json)
+
+
+def image_array(content: bytes) -> Any:
+    """The pixels of an image as a uint8 array, height x width x 3. Needs numpy and Pillow."""
+    import numpy as np
+    from PIL import Image
+
+    with Image.open(io.BytesIO(content)) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def save(content: bytes, path: Path | str) -> Path:
+    """Write a file, which appears only when it is complete."""
+    target = Path(path)
+    part = target.with_name(target.name + ".part")
+    part.write_bytes(content)
+    part.replace(target)
+    return target
+
+
+def _json(response: httpx2.Response) -> dict[str, Any]:
+    value: dict[str, Any] = response.json()
+    return value
+
+
+def _job(response: httpx2.Response) -> RemoteJob:
+    return RemoteJob.of(response.json())
+
+
+def _page(response: httpx2.Response) -> tuple[list[RemoteJob], str | None]:
+    body = response.json()
+    return [RemoteJob.of(document) for document in body["jobs"]], body["next"]
+
+
+def _content(response: httpx2.Response) -> bytes:
+    return response.content
+
+
+def _text(name: str, value: Any) -> str:
+    if name == "target":
+        return ",".join(str(float(number)) for number in value)
+    if name == "pose":
+        return json.dumps([[float(number) for number in row] for row in value])
+    return str(value)

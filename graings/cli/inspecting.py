@@ -1,0 +1,39 @@
+"""The command that inspects a capture before anything is trained."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from graings.cli.terminal import busy_status, print_line
+from graings.cli.training import Settings, setting
+from graings.config import make_config
+from graings.inspection.inspect import inspect_capture
+from graings.plan.cost import stored_calibration
+from graings.storage.files import write_bytes
+
+
+def inspect(
+    capture: Annotated[Path, typer.Argument(help="Folder of the capture.")],
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", "-o", metavar="PNG", help="Write some images with the bounds of the scene there."),
+    ] = None,
+    settings: Settings = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The document instead of text.")] = False,
+) -> None:
+    """Show what is in a capture, what is suspicious about it, and what trainings would take. Nothing is trained."""
+    config = make_config(overrides=dict(setting(text) for text in settings or ()))
+    with busy_status("reading the capture, and matching its pictures"):
+        document, png = inspect_capture(capture, config.capture, stored_calibration())
+    if picture is not None:
+        write_bytes(picture, png)
+    if as_json:
+        Console().print_json(json.dumps(document.to_json()))
+        return
+    for line in document.lines():
+        print_line(line)

@@ -1,0 +1,50 @@
+"""The first phase of a job on a video or on photographs: their capture, in the job's folder."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+from graings.footage.make_capture import TRANSFORMS, make_capture
+from graings.footage.report import lines
+from graings.footage.source import find_footage
+from jobs.progress import ProgressReport, ProgressWriter
+from jobs.store import JobFolder
+
+
+class Stopped(Exception):
+    """The job was asked to stop; what is done so far is kept."""
+
+
+def capture_of(
+    upload: Path, folder: JobFolder, threads: int, iterations: int, progress: ProgressWriter, stop: threading.Event
+) -> tuple[Path, list[str]]:
+    """The capture to train on: `upload` itself, or the one that is made of its footage, and lines for the log.
+
+    An interrupted call continues where it was. Raises `Stopped` when `stop` is set, and `CaptureError` where the
+    footage does not hold together.
+    """
+    footage = find_footage(upload)
+    if footage is None:
+        return upload, []
+    if (folder.capture / TRANSFORMS).exists():
+        return folder.capture, []
+    attempts = folder.attempts()
+
+    def observe(step: str, done: int, total: int) -> None:
+        progress.write(
+            ProgressReport(
+                phase="capture",
+                step=step,
+                step_done=done,
+                step_total=total,
+                iteration=0,
+                iterations=iterations,
+                attempt=attempts[-1].number if attempts else 1,
+            )
+        )
+        if stop.is_set():
+            raise Stopped
+
+    report = make_capture(footage, folder.capture, threads=threads, observe=observe)
+    return folder.capture, lines(report)
