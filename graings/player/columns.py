@@ -78,8 +78,8 @@ def unpack(table: Table, body: bytes) -> NDArray[np.float32]:
     for plane in range(table.planes):
         found = np.frombuffer(body, dtype=np.uint8, count=size, offset=table.start + plane * size)
         numbers |= found.astype(np.int64) << (8 * plane)
-    numbers = numbers.reshape(table.columns, table.rows)
+    columns = numbers.reshape(table.columns, table.rows)
     if table.delta:
-        numbers = np.where(numbers % 2 == 0, numbers // 2, -(numbers + 1) // 2).cumsum(axis=1)
+        columns = np.where(columns % 2 == 0, columns // 2, -(columns + 1) // 2).cumsum(axis=1)
     offsets, steps = np.asarray(table.offsets)[:, None], np.asarray(table.steps)[:, None]
-    return (offsets + steps * numbers).astype(np.float32).T
+    return (offsets + steps * columns).astype(np.float32).T
