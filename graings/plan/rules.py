@@ -50,7 +50,7 @@ def nothing_shown(statistics: CaptureStatistics) -> list[str]:
         return []
     return [
         f"the {statistics.examined} training images that were looked at show one colour and nothing else: there is "
-        "nothing to learn, and every metric will be perfect."
+        "nothing to learn, and high metrics say nothing."
     ]
 
 

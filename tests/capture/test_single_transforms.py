@@ -101,6 +101,19 @@ def test_times_come_from_names_when_configured_and_the_file_gives_none(tmp_path:
         ("FULL_OPENCV", {"k1": -0.1, "k2": 0.02, "k3": 0.003}, (-0.1, 0.02, 0.0, 0.0, 0.003, 0.0, 0.0, 0.0)),
         ("OPENCV_FISHEYE", {"camera_model": "OPENCV_FISHEYE", "k1": 0.01}, (0.01, 0.0, 0.0, 0.0)),
         ("OPENCV_FISHEYE", {"is_fisheye": True, "k2": 0.01}, (0.0, 0.01, 0.0, 0.0)),
+        ("OPENCV_FISHEYE", {"camera_model": "SIMPLE_RADIAL_FISHEYE", "k1": 0.02}, (0.02, 0.0, 0.0, 0.0)),
+        ("OPENCV_FISHEYE", {"camera_model": "RADIAL_FISHEYE", "k1": 0.02, "k2": 0.01}, (0.02, 0.01, 0.0, 0.0)),
+        (
+            "THIN_PRISM_FISHEYE",
+            {"camera_model": "THIN_PRISM_FISHEYE", "k1": 0.01, "p1": 0.001, "k3": 0.002, "sx1": 0.001},
+            (0.01, 0.0, 0.001, 0.0, 0.002, 0.0, 0.001, 0.0),
+        ),
+        (
+            "FULL_OPENCV",
+            {"camera_model": "FULL_OPENCV", "k1": -0.1, "k4": 0.01, "k6": 0.002},
+            (-0.1, 0.0, 0.0, 0.0, 0.0, 0.01, 0.0, 0.002),
+        ),
+        ("FOV", {"camera_model": "FOV", "omega": 0.3}, (0.3,)),
     ],
 )
 def test_distorted_lenses_are_undistorted_as_pycolmap_does(
@@ -119,6 +132,28 @@ def test_distorted_lenses_are_undistorted_as_pycolmap_does(
     ours = ImageStore((0.0, 0.0, 0.0)).rgb(frame) * 255
     theirs = np.asarray(image.to_array(), dtype=np.float32)
     np.testing.assert_allclose(ours[1:-1, 1:-1], theirs[1:-1, 1:-1], rtol=0, atol=1.01)  # theirs has 8 bits
+
+
+def test_applied_transform_changes_neither_poses_nor_points(tmp_path: Path) -> None:
+    """nerfstudio stores poses and points after it: it only leads back to the axes of COLMAP."""
+    applied = [[0.0, 1.0, 0.0, 3.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 1.0]]
+    plain = load_capture(write_single(tmp_path / "plain", 4))
+    transformed = load_capture(write_single(tmp_path / "applied", 4, applied_transform=applied, applied_scale=0.5))
+    for (_, one), (_, other) in zip(plain, transformed, strict=True):
+        np.testing.assert_array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
+
+
+def test_intrinsics_of_frames_win_over_those_of_the_file(tmp_path: Path) -> None:
+    write_single(tmp_path, 4)
+    path = tmp_path / "transforms.json"
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        number = int(frame["file_path"][-9:-4])
+        frame.update(fl_x=50.0 + number, fl_y=40.0 + number, cx=30.0 + number)
+    path.write_text(json.dumps(document))
+    for _, frame in load_capture(tmp_path):
+        number, camera = int(frame.name[-9:-4]), frame.camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0 + number, 40.0 + number, 30.0 + number, 19.0)
 
 
 def test_a_lens_of_the_frame_wins_over_that_of_the_file(tmp_path: Path) -> None:
@@ -156,7 +191,11 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "no frames": (top(frames=[]), r"transforms\.json, frames: has no frames"),
     "another kind of camera": (
         top(camera_model="EQUIRECTANGULAR"),
-        r"transforms\.json, frames\[0\]: the camera model EQUIRECTANGULAR is not supported",
+        r"transforms\.json, frames\[0\]: pictures of the camera model EQUIRECTANGULAR show all directions.*Cut each",
+    ),
+    "an unknown kind of camera": (
+        top(camera_model="FISHEYE624"),
+        r"transforms\.json, frames\[0\]: the camera model FISHEYE624 is not supported",
     ),
     "tangential fisheye": (
         top(is_fisheye=True, p1=0.1),

@@ -119,8 +119,8 @@ def spoil_loss(
     """Multiply the photometric loss by `factor` in the steps that `when` chooses."""
     true = objective_module.photometric
 
-    def spoiled(image: Tensor, target: Tensor, *weights: float) -> Tensor:
-        value = true(image, target, *weights)
+    def spoiled(image: Tensor, target: Tensor, *weights: float, valid: Tensor | None = None) -> Tensor:
+        value = true(image, target, *weights, valid=valid)
         return value * factor if when(trainer.iteration) else value
 
     monkeypatch.setattr(objective_module, "photometric", spoiled)

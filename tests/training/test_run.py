@@ -132,11 +132,11 @@ def test_a_halted_machine_costs_training_time_and_no_processor_time(
 ) -> None:
     slept = 0.0
 
-    def slowly(*arguments: Any) -> torch.Tensor:
+    def slowly(*arguments: Any, **options: Any) -> torch.Tensor:
         nonlocal slept
         slept += 0.1
         time.sleep(0.1)
-        return photometric(*arguments)
+        return photometric(*arguments, **options)
 
     monkeypatch.setattr("graings.training.objective.photometric", slowly)
     list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=10, threads=1)))
