@@ -22,6 +22,7 @@ from graings.camera.viewpoint import background_rgb
 from graings.cli.exporting import export
 from graings.cli.footage import capture
 from graings.cli.inspecting import inspect
+from graings.cli.doctor import doctor
 from graings.cli.option_table import show_options
 from graings.cli.planning import plan
 from graings.cli.rendering import render_view
@@ -89,6 +90,7 @@ app.command()(plan)
 app.command()(inspect)
 app.command()(synthesize)
 app.command()(capture)
+app.command()(doctor)
 app.command(cls=MultiValueCommand)(ablate)
 app.command(name="render")(render_view)
 app.command()(video)
