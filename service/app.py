@@ -74,7 +74,7 @@ def create_app(settings: Settings) -> FastAPI:
     problems.install(app)
     # Added last, so that it comes first: a refused request costs next to nothing.
     app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
-    app.state.stopping = False
+    app.state.stopping = lambda: False
     app.state.registry = registry = CollectorRegistry(auto_describe=False)
     app.add_middleware(Head)
     app.add_middleware(SecurityHeaders)

@@ -64,9 +64,9 @@ def serve(
     logs: dict[str, Any] = {"log_config": None, "access_log": False}
     config = uvicorn.Config(app, settings.host, settings.port, timeout_graceful_shutdown=GRACEFUL_S, **logs)
     server = uvicorn.Server(config)
+    app.state.stopping = lambda: server.should_exit  # event streams end; their clients come back to the next process
 
     def stop() -> None:
-        app.state.stopping = True  # event streams end, and their clients come back to the next process
         server.should_exit = True
 
     # uvicorn handles signals and raises them again after it has ended; that must not interrupt the end of the worker.

@@ -14,6 +14,7 @@ import torch
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from graings.errors import GraingsError
 from graings.evaluation.perceptual import PerceptualDistances
@@ -41,7 +42,7 @@ def doctor(
         found: Callable[[Path], Iterable[Check]] = entry.load()
         checks += found(data)
     for name, verdict, text in checks:
-        table.add_row(f"[{COLORS[verdict]}]{verdict}[/]", name, text)
+        table.add_row(Text(verdict, COLORS[verdict]), name, Text(text))
     Console().print(table)
     raise typer.Exit(int(any(verdict == "broken" for _, verdict, _ in checks)))
 

@@ -120,7 +120,7 @@ async def events(
     path = here.store.folder(job.id).progress
     position = last_event_id if last_event_id is not None else await to_thread.run_sync(last_start, path)
     state: JobState | None = None
-    while not (request.app.state.stopping or await request.is_disconnected()):
+    while not (request.app.state.stopping() or await request.is_disconnected()):
         try:
             # The state first: all that was reported before the job ended is then read below.
             job = await to_thread.run_sync(here.jobs.get, job.id)

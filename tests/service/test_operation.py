@@ -110,7 +110,7 @@ def test_a_service_stops_with_open_streams_and_their_clients_come_back(tmp_path:
         writer.write(ProgressReport(phase="joint", iteration=7, iterations=9, attempt=1))
         writer.close()
         with running(data, port=int(url.rpartition(":")[2])):
-            Client(url).cancel(job)
+            client.cancel(job)
             thread.join(60)
     assert not thread.is_alive()
     assert [event.data["iteration"] for event in seen if event.kind == "progress"] == [7]
