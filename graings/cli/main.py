@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.text import Text
 
 from graings.camera.viewpoint import background_rgb
+from graings.cli.doctor import doctor
 from graings.cli.exporting import export
 from graings.cli.footage import capture
 from graings.cli.inspecting import inspect
-from graings.cli.doctor import doctor
 from graings.cli.option_table import show_options
 from graings.cli.planning import plan
 from graings.cli.rendering import render_view
