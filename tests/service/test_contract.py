@@ -27,8 +27,8 @@ from tests.service.contract import SNAPSHOT, summary
 BRIEF = {"iterations": 12, "init.points": 200, "evaluation.views": 1}
 LONG_S = 120.0
 
-# What a schema cannot say: a body that is no capture, options that are none, numbers with commas between them, a view of
-# the capture, an image in no format that we have.
+# What a schema cannot say: a body that is no capture, options that are none, numbers with commas between them, a view
+# of the capture, an image in no format that we have.
 FUZZ = """
 [[operations]]
 include-operation-id = ["submit_job", "plan_training", "inspect_capture", "render", "get_export", "get_comparison"]
