@@ -44,10 +44,15 @@ class Client:
         config: calls.Query | None = None,
         name: str | None = None,
         priority: int = 10,
+        webhook: str | None = None,
         observe: Observe | None = None,
     ) -> RemoteJob:
-        """Train on a capture: a folder, or a zip, tar or tar.gz of one. `observe` gets the bytes sent and all."""
-        call = calls.submit(name or Path(capture).stem, preset, config, priority, uuid.uuid4().hex)
+        """Train on a capture: a folder, or a zip, tar or tar.gz of one. `observe` gets the bytes sent and all.
+
+        `webhook` is an address that is told what happens; `webhook_secret` in the document of the answer verifies its
+        messages.
+        """
+        call = calls.submit(name or Path(capture).stem, preset, config, priority, webhook, uuid.uuid4().hex)
         with packed(capture) as archive:
             return self._do(call, chunks(archive, observe))
 

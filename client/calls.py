@@ -64,8 +64,11 @@ def no_answer(url: httpx2.URL, error: Exception) -> str:
     return f"{url} does not answer: {error or type(error).__name__}. Is the service running there?"
 
 
-def submit(name: str, preset: str, config: Query | None, priority: int, key: str) -> Call[RemoteJob]:
+def submit(
+    name: str, preset: str, config: Query | None, priority: int, webhook: str | None, key: str
+) -> Call[RemoteJob]:
     query = {"name": name, "preset": preset, "priority": priority, "config": json.dumps(dict(config or {}))}
+    query |= {} if webhook is None else {"webhook": webhook}
     headers = {"Content-Type": "application/octet-stream", "Idempotency-Key": key}
     return Call("POST", "/jobs", _job, query, headers)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import sys
@@ -13,6 +12,7 @@ from typing import Annotated
 import typer
 
 from jobs.job import JobError
+from jobs.logs import log_to_stderr
 from jobs.parent import watch_parent
 from jobs.store import Store
 from jobs.worker import Worker
@@ -48,16 +48,12 @@ def worker(
             envvar="GRAINGS_NICE", min=0, max=19, help="Lower the priority of trainings on the CPU by so much."
         ),
     ] = TRAINING_NICE,
-    private_webhooks: Annotated[
-        bool,
-        typer.Option(envvar="GRAINGS_PRIVATE_WEBHOOKS", help="Let webhooks be addresses inside this network."),
-    ] = False,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="Stop when standard input ends.")
     ] = False,
 ) -> None:
     """Take training jobs from the queue until interrupted, then stop the running jobs at a checkpoint."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
+    log_to_stderr()
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -69,7 +65,7 @@ def worker(
     job_threads = threads or max(1, cores // slots)
     try:
         url = database or default_database(store.root)
-        Worker(store, url, slots=slots, threads=job_threads, nice=nice, private_webhooks=private_webhooks).run(stop)
+        Worker(store, url, slots=slots, threads=job_threads, nice=nice).run(stop)
     except JobError as error:
         typer.echo(f"worker: {error}", err=True)
         raise typer.Exit(1) from error

@@ -30,7 +30,6 @@ APPLICATION = "graings"
 # version. Increase it only when the steps change.
 VERSION = "jobs-1"
 POLL_S = 0.5
-MESSAGES_AT_ONCE = 4
 
 # What a query raises when the database does not answer.
 _CONNECTION_ERRORS = (
@@ -231,7 +230,7 @@ def executing(
     DBOS.launch()
     try:
         DBOS.register_queue(QUEUE, worker_concurrency=slots, polling_interval_sec=POLL_S, on_conflict="always_update")
-        DBOS.register_queue(MESSAGES, worker_concurrency=MESSAGES_AT_ONCE, polling_interval_sec=POLL_S)
+        DBOS.register_queue(MESSAGES, worker_concurrency=4, polling_interval_sec=POLL_S)
         yield
     finally:
         DBOS.destroy(destroy_registry=True)

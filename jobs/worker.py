@@ -37,23 +37,13 @@ MAX_WORKER_DEATHS = 5
 class Worker:
     """One worker process: `slots` jobs at a time, `threads` CPU threads each, with a priority lowered by `nice`."""
 
-    def __init__(
-        self,
-        store: Store,
-        database_url: str,
-        *,
-        slots: int = 1,
-        threads: int = 1,
-        nice: int = 0,
-        private_webhooks: bool = False,
-    ) -> None:
+    def __init__(self, store: Store, database_url: str, *, slots: int = 1, threads: int = 1, nice: int = 0) -> None:
         self.id = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
         self._store = store
         self._url = database_url
         self._slots = slots
         self._threads = threads
         self._nice = nice
-        self._private_webhooks = private_webhooks
         self._trainers: dict[str, TrainerChild] = {}
         self._stopping = False
 
@@ -133,8 +123,7 @@ class Worker:
         try:
             spec = self._store.folder(job_id).spec()
             if spec.webhook and spec.webhook_secret:
-                private = self._private_webhooks
-                deliver(spec.webhook, spec.webhook_secret, message_id, content, private=private)
+                deliver(spec.webhook, spec.webhook_secret, message_id, content)
         except JobNotFound:
             return  # deleted meanwhile
         except WebhookError as error:

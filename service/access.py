@@ -15,7 +15,7 @@ from fastapi import Depends, Request, Security
 from fastapi.routing import APIRoute
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
-from jobs.job import JobDamaged, JobNotFound, JobSpec
+from jobs.job import JobNotFound, JobSpec
 from service.context import Context, ContextDep
 from service.keys import Key, Scope
 from service.problems import Forbidden, Unauthorized
@@ -31,6 +31,7 @@ NEEDS: Final[dict[str, Scope]] = {
     "render": Scope.VIEW,
     "get_scene": Scope.VIEW,
     "get_views": Scope.VIEW,
+    "get_service_metrics": Scope.ADMIN,
 }
 
 _bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key that `graings keys create` has shown.")
@@ -81,13 +82,14 @@ def authorize(request: Request, context: ContextDep, header: BearerDep, session:
     if by_session and request.method not in SAFE_METHODS and "origin" not in request.headers:
         raise Forbidden("A session is for pages of this service. Programs send Authorization: Bearer.", needed)
     job_id = request.path_params.get("job_id") or request.query_params.get("job")
-    if job_id is not None and caller.scope is not Scope.ADMIN:
-        _check_job(context, caller, job_id)
+    if job_id is not None and not caller.sees(job_id, context.jobs.spec(job_id)):
+        raise JobNotFound(job_id)
     request.state.caller = caller
     if caller.key is None:
         yield
         return
-    name = caller.key.parent or caller.key.id  # all sessions of a key, or of a link, together
+    # All sessions of a key together, and a link apart from its key.
+    name = caller.key.parent if caller.key.parent and caller.key.kind == "session" else caller.key.id
     context.request_limits.begin(name)
     try:
         yield
@@ -99,15 +101,6 @@ def _needed(request: Request) -> Scope:
     route = request.scope.get("route")
     name = route.operation_id if isinstance(route, APIRoute) else None
     return NEEDS.get(name or "", Scope.READ if request.method in SAFE_METHODS else Scope.TRAIN)
-
-
-def _check_job(context: Context, caller: Caller, job_id: str) -> None:
-    try:
-        spec = context.store.folder(job_id).spec()
-    except JobDamaged as error:
-        raise JobNotFound(job_id) from error  # nobody knows whose it is
-    if not caller.sees(job_id, spec):
-        raise JobNotFound(job_id)
 
 
 def _caller_of(request: Request) -> Caller:

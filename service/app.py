@@ -10,6 +10,7 @@ from typing import Any
 from anyio import to_thread
 from fastapi import Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
+from prometheus_client import CollectorRegistry
 
 import graings
 from graings.kernel import use_threads
@@ -24,6 +25,7 @@ from service.routes import captures, export, jobs, plans, render, results, scene
 from service.same_origin import SameOrigin
 from service.security_headers import SecurityHeaders
 from service.settings import Settings
+from service.telemetry import ServiceNumbers, Telemetry
 
 _SMALL_BODY = 64 * 1024
 
@@ -49,6 +51,7 @@ def create_app(settings: Settings) -> FastAPI:
         use_threads(settings.render_threads)
         sys.setswitchinterval(SWITCH_S)
         app.state.context = await to_thread.run_sync(open_context, settings)
+        registry.register(ServiceNumbers(app.state.context))
         try:
             yield
         finally:
@@ -71,8 +74,11 @@ def create_app(settings: Settings) -> FastAPI:
     problems.install(app)
     # Added last, so that it comes first: a refused request costs next to nothing.
     app.add_middleware(Admission, path="/render", limit=settings.images_at_once + settings.render_waiting)
+    app.state.stopping = lambda: False
+    app.state.registry = registry = CollectorRegistry(auto_describe=False)
     app.add_middleware(Head)
     app.add_middleware(SecurityHeaders)
+    app.add_middleware(Telemetry, registry=registry)
     for routes in (captures, jobs, plans, results, export, render, scenes, sessions, system):
         app.include_router(routes.router, dependencies=[Depends(authorize)])
     for routes in (sessions, system):

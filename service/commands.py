@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import signal
-import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 import uvicorn
@@ -15,6 +13,7 @@ import uvicorn
 from graings.errors import ConfigError
 from jobs.engine import Engine
 from jobs.job import JobError
+from jobs.logs import log_to_stderr
 from jobs.parent import watch_parent
 from jobs.store import Store
 from service.app import create_app
@@ -22,7 +21,7 @@ from service.keys import Keys
 from service.settings import Settings
 from service.worker_child import WorkerChild
 
-GRACEFUL_S = 3  # for open requests; event streams do not end by themselves
+GRACEFUL_S = 10  # for open requests, such as an image that is being rendered
 
 
 def serve(
@@ -41,7 +40,7 @@ def serve(
     ] = False,
 ) -> None:
     """Serve the REST interface and its page until interrupted."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
+    log_to_stderr()
     try:
         settings = Settings.from_environment(data=data, database=database, host=host, port=port)
     except ConfigError as error:
@@ -61,16 +60,11 @@ def serve(
             err=True,
         )
         raise typer.Exit(2)
-    server = uvicorn.Server(
-        uvicorn.Config(
-            create_app(settings),
-            host=settings.host,
-            port=settings.port,
-            timeout_graceful_shutdown=GRACEFUL_S,
-            log_config=None,
-            access_log=False,
-        )
-    )
+    app = create_app(settings)
+    logs: dict[str, Any] = {"log_config": None, "access_log": False}
+    config = uvicorn.Config(app, settings.host, settings.port, timeout_graceful_shutdown=GRACEFUL_S, **logs)
+    server = uvicorn.Server(config)
+    app.state.stopping = lambda: server.should_exit  # event streams end; their clients come back to the next process
 
     def stop() -> None:
         server.should_exit = True

@@ -21,9 +21,7 @@ Data = Annotated[Path, typer.Option(envvar="GRAINGS_DATA", help="The service's f
 def create(
     scope: Annotated[
         Literal["read", "train", "admin"],
-        typer.Option(
-            help="read: see and render its own jobs; train: also submit and change them; admin: the jobs of all.",
-        ),
+        typer.Option(help="read: see and render its own jobs; train: also change them; admin: the jobs of all."),
     ],
     name: Annotated[str, typer.Option(help="Whose key it is, for `keys list`.")],
     data: Data = Path("data"),

@@ -30,16 +30,12 @@ _SECRET = re.compile(rf"graings_({_ID.pattern})_([A-Za-z0-9_-]{{43}})")
 
 
 class Scope(StrEnum):
-    """What a key allows; each scope includes those before it."""
+    """What a key allows: to look at one shared job (only links), to read and render its jobs, to change them, all."""
 
     VIEW = "view"
-    """Look at one shared job; only links have it."""
     READ = "read"
-    """Read and render the jobs of the key."""
     TRAIN = "train"
-    """Submit and change the jobs of the key."""
     ADMIN = "admin"
-    """Everything, with the jobs of all keys."""
 
     def includes(self, other: Scope) -> bool:
         """Whether a key of this scope may do what needs `other`."""
@@ -122,12 +118,10 @@ class Keys:
 
     def root(self, key: Key) -> str | None:
         """The id of the key from which a session or link was made, or its own; None if it was made without a key."""
-        while key.kind != "key":
-            above = None if key.parent is None else self.get(key.parent)
-            if above is None:
-                return None
-            key = above
-        return key.id
+        if key.kind == "key":
+            return key.id
+        above = self.get(key.parent or "")
+        return None if above is None else self.root(above)
 
     def all(self) -> list[Key]:
         """All keys, sessions and links, oldest first."""
@@ -155,7 +149,7 @@ class Keys:
     def _usable(self, key: Key) -> bool:
         if not key.valid:
             return False
-        above = None if key.parent is None else self.get(key.parent)
+        above = self.get(key.parent or "")
         return key.parent is None or (above is not None and self._usable(above))
 
     def _file(self, key_id: str, suffix: str = "json") -> Path:

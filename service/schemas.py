@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import datetime
 from time import time
 from typing import Any
 
@@ -102,23 +102,7 @@ def job_summary(job: Job) -> JobSummary:
         links |= {"metrics": f"{base}/metrics", "curve": f"{base}/curve.svg", "report": f"{base}/report"}
     if job.has_model:
         links["model"] = f"{base}/model"
-    return JobSummary(
-        id=job.id,
-        name=job.spec.name,
-        state=job.state,
-        priority=job.spec.priority,
-        created_at=moment(job.created_at),
-        started_at=None if job.started_at is None else moment(job.started_at),
-        finished_at=None if job.finished_at is None else moment(job.finished_at),
-        queued_s=(job.started_at or job.finished_at or time()) - job.created_at,
-        attempts=job.attempts,
-        progress=job.progress,
-        checkpoint=job.checkpoint,
-        error=job.error,
-        links=links,
-    )
-
-
-def moment(seconds: float) -> datetime:
-    """Unix seconds as a date."""
-    return datetime.fromtimestamp(seconds, UTC)
+    same = ("id", "state", "created_at", "started_at", "finished_at", "attempts", "progress", "checkpoint", "error")
+    values: dict[str, Any] = {name: getattr(job, name) for name in same}
+    queued_s = (job.started_at or job.finished_at or time()) - job.created_at
+    return JobSummary(**values, name=job.spec.name, priority=job.spec.priority, queued_s=queued_s, links=links)

@@ -80,9 +80,9 @@ async def receive_capture(request: Request, uploads: Path, limits: Limits) -> As
         if request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
             async with request.form(max_files=1, max_fields=1) as form:
                 config = _config_field(form)
-                digest = await _store_file(_capture_field(form), archive)
+                digest = await _store(_chunks(_capture_field(form)), archive)
         else:
-            config, digest = {}, await _store_stream(request, archive)
+            config, digest = {}, await _store(request.stream(), archive)
         suffix = await to_thread.run_sync(video_suffix, archive)
         if suffix is None:
             await to_thread.run_sync(unpack, archive, folder, limits)
@@ -107,22 +107,18 @@ def parse_config(text: str, where: str) -> dict[str, Any]:
     return value
 
 
-async def _store_stream(request: Request, archive: Path) -> str:
+async def _store(chunks: AsyncIterator[bytes], archive: Path) -> str:
     digest = hashlib.sha256()
     async with await open_file(archive, "xb") as file:
-        async for chunk in request.stream():
+        async for chunk in chunks:
             digest.update(chunk)
             await file.write(chunk)
     return digest.hexdigest()
 
 
-async def _store_file(upload: UploadFile, archive: Path) -> str:
-    digest = hashlib.sha256()
-    async with await open_file(archive, "xb") as file:
-        while chunk := await upload.read(_CHUNK):
-            digest.update(chunk)
-            await file.write(chunk)
-    return digest.hexdigest()
+async def _chunks(upload: UploadFile) -> AsyncIterator[bytes]:
+    while chunk := await upload.read(_CHUNK):
+        yield chunk
 
 
 def _capture_field(form: FormData) -> UploadFile:

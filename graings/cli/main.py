@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.text import Text
 
 from graings.camera.viewpoint import background_rgb
+from graings.cli.doctor import doctor
 from graings.cli.exporting import export
 from graings.cli.footage import capture
 from graings.cli.inspecting import inspect
@@ -89,6 +90,7 @@ app.command()(plan)
 app.command()(inspect)
 app.command()(synthesize)
 app.command()(capture)
+app.command()(doctor)
 app.command(cls=MultiValueCommand)(ablate)
 app.command(name="render")(render_view)
 app.command()(video)

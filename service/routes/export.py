@@ -8,7 +8,7 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from graings.export.export import FRAMES, SEQUENCE, ExportRequest, export_splats
+from graings.export.export import FORMATS, FRAMES, SEQUENCE, ExportRequest, export_splats
 from graings.export.selection import Selection
 from service.context import ContextDep, JobId
 from service.problems import RESPONSES, BadRequest, Busy, NotYet
@@ -25,7 +25,10 @@ class ExportQuery(BaseModel):
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    format: str = Field(description="ply, compressed.ply, spz, sog, splat, glb, or zip: a sequence of PLY files.")
+    format: str = Field(
+        json_schema_extra={"enum": list(FORMATS)},
+        description="ply, compressed.ply, spz, sog, splat, glb, or zip: a sequence of PLY files.",
+    )
     t: float = Field(0.0, ge=0, le=1, description="Time.")
     frames: int = Field(FRAMES, ge=1, le=MAX_FRAMES, description="Number of times in a zip.")
     degree: int | None = Field(None, ge=0, le=3, description="Of the spherical harmonics; default: what is needed.")

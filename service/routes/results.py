@@ -52,38 +52,32 @@ EVENT_STREAM: dict[str, Any] = {
 @router.get("/metrics", operation_id="get_metrics", response_model=Metrics)
 def metrics(job_id: JobId, here: ContextDep) -> Response:
     """The metrics document, schema `graings.metrics/1`; it is rewritten after every evaluation."""
-    path = _existing(here.store.folder(job_id).metrics, "metrics", "They come with the first evaluation.")
-    return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
+    return _current(here.store.folder(job_id).metrics, "metrics")
 
 
 @router.get("/plan", operation_id="get_plan", response_model=Plan)
 def plan(job_id: JobId, here: ContextDep) -> Response:
     """The plan of the training, schema `graings.plan/1`; training adds what it decides and what it measured."""
-    path = _existing(here.store.folder(job_id).plan, "plan", "It comes when training begins; POST /plans makes one.")
-    return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
+    when = "It comes when training begins; POST /plans makes one."
+    return _current(here.store.folder(job_id).plan, "plan", when)
 
 
 @router.get("/curve.svg", operation_id="get_curve", response_class=FileResponse)
 def curve(job_id: JobId, here: ContextDep) -> Response:
     """Held-out error against training time, as a plot."""
-    path = _existing(here.store.folder(job_id).curve, "curve", "It comes with the first evaluation.")
-    return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
+    return _current(here.store.folder(job_id).curve, "curve")
 
 
 @router.get("/report", operation_id="get_report", response_model=WorkPrecision)
 def report(job_id: JobId, here: ContextDep) -> Response:
     """The work-precision report, schema `graings.work_precision/1`: error against time, iterations and Gaussians."""
-    file = here.store.folder(job_id).report / REPORT_FILE
-    path = _existing(file, "report", "It comes with the first evaluation.")
-    return Response(path.read_bytes(), media_type="application/json", headers={"Cache-Control": "no-cache"})
+    return _current(here.store.folder(job_id).report / REPORT_FILE, "report")
 
 
 @router.get("/report.svg", operation_id="get_report_plot", response_class=FileResponse)
 def report_plot(job_id: JobId, here: ContextDep) -> Response:
     """The work-precision report as a plot."""
-    file = here.store.folder(job_id).report / "training.svg"
-    path = _existing(file, "report", "It comes with the first evaluation.")
-    return Response(path.read_bytes(), media_type="image/svg+xml", headers={"Cache-Control": "no-cache"})
+    return _current(here.store.folder(job_id).report / "training.svg", "report")
 
 
 @router.get("/model", operation_id="get_model", response_class=FileResponse)
@@ -126,7 +120,7 @@ async def events(
     path = here.store.folder(job.id).progress
     position = last_event_id if last_event_id is not None else await to_thread.run_sync(last_start, path)
     state: JobState | None = None
-    while not await request.is_disconnected():
+    while not (request.app.state.stopping() or await request.is_disconnected()):
         try:
             # The state first: all that was reported before the job ended is then read below.
             job = await to_thread.run_sync(here.jobs.get, job.id)
@@ -148,3 +142,10 @@ def _existing(path: Path, what: str, when: str) -> Path:
     if not path.exists():
         raise NotYet(f"This job has no {what} yet. {when}")
     return path
+
+
+def _current(path: Path, what: str, when: str = "It comes with the first evaluation.") -> Response:
+    """A file that training writes again."""
+    media_type = "image/svg+xml" if path.suffix == ".svg" else "application/json"
+    headers = {"Cache-Control": "no-cache"}
+    return Response(_existing(path, what, when).read_bytes(), media_type=media_type, headers=headers)

@@ -12,7 +12,6 @@ from service.access import COOKIE, BearerDep, CallerDep, SessionDep, identify
 from service.context import ContextDep, JobId
 from service.keys import SESSION_S, Key, Scope
 from service.problems import RESPONSES, NotYet, Unauthorized
-from service.schemas import moment
 
 # The routes of the session check their caller themselves.
 open_router = APIRouter(prefix="/session", tags=["access"], responses=RESPONSES)
@@ -99,5 +98,4 @@ def revoke_link(job_id: JobId, link_id: Annotated[str, Path(max_length=64)], con
 
 
 def _link(key: Key) -> LinkResource:
-    used_at = None if key.used_at is None else moment(key.used_at)
-    return LinkResource(id=key.id, name=key.name, created_at=moment(key.created_at), used_at=used_at)
+    return LinkResource.model_validate(key, from_attributes=True)

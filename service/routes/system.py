@@ -6,7 +6,8 @@ from functools import cache
 from pathlib import Path
 
 from fastapi import APIRouter, Request
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import FileResponse, PlainTextResponse, Response
+from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
 from graings.capture.synthetic import SUITE
 from graings.config import options
@@ -30,6 +31,12 @@ def all_options() -> OptionsResource:
 def _options() -> OptionsResource:
     scenes = [{"name": scene.name, "question": scene.question} for scene in SUITE]
     return OptionsResource.model_validate({**options(), "scenes": scenes})
+
+
+@router.get("/metrics", operation_id="get_service_metrics", response_class=PlainTextResponse, responses=RESPONSES)
+def metrics(request: Request) -> Response:
+    """Numbers of the service for Prometheus: requests, jobs, workers, images, disk."""
+    return Response(generate_latest(request.app.state.registry), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @open_router.get("/healthz", operation_id="get_health")

@@ -23,7 +23,7 @@ from jobs.job import JobSpec
 from jobs.lease import FileLeases
 from jobs.queue import JobQueue
 from jobs.store import Store
-from jobs.webhooks import WebhookError, deliver
+from jobs.webhooks import PRIVATE, WebhookError, deliver
 from jobs.worker import Worker, requeue_jobs_of_dead_workers
 
 LONG_S = 120.0
@@ -90,12 +90,13 @@ def test_a_job_tells_its_webhook_what_happens_and_tries_again(
     jobs: JobQueue, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("jobs.worker.RETRY_AFTER_S", (0.2,) * 5)
+    monkeypatch.setenv(PRIVATE, "1")
     receiver.statuses = [500, 503, 200]
     job = submit(jobs, receiver.url)
     secret = jobs.get(job).spec.webhook_secret
     assert secret is not None
     stop = threading.Event()
-    worker = Worker(jobs.store, default_database(jobs.store.root), private_webhooks=True)
+    worker = Worker(jobs.store, default_database(jobs.store.root))
     thread = threading.Thread(target=worker.run, args=(stop,))
     thread.start()
     deadline = time.monotonic() + LONG_S
@@ -128,7 +129,9 @@ def test_a_cancelled_job_says_so(jobs: JobQueue) -> None:
 
 
 def send(url: str, private: bool) -> None:
-    deliver(url, SECRET, "id", {"type": "job.ended"}, private=private)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(PRIVATE, "1" if private else "")
+        deliver(url, SECRET, "id", {"type": "job.ended"})
 
 
 def test_an_address_inside_the_network_is_refused_unless_allowed(receiver: Receiver) -> None:

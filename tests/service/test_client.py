@@ -63,7 +63,10 @@ def test_a_folder_is_packed_sent_and_queued(
     assert job.document["config"]["iterations"] == 12
     assert sent[-1][0] == sent[-1][1] > 10_000
     (tmp_path / "again.zip").write_bytes(archive)
-    assert remote.submit(tmp_path / "again.zip").name == "again"
+    again = remote.submit(tmp_path / "again.zip", webhook="https://receiver.example/hook")
+    assert (again.name, again.document["webhook"]) == ("again", "https://receiver.example/hook")
+    assert again.document["webhook_secret"].startswith("whsec_")
+    assert "webhook_secret" not in {k for k, v in remote.job(again.id).document.items() if v}
     assert [job.name for job in remote.jobs(limit=1)] == ["again", capture.stem]
     assert remote.cancel(job.id).state == "cancelled"
     assert remote.resume(job.id).state == "queued"

@@ -27,10 +27,11 @@ from tests.service.contract import SNAPSHOT, summary
 BRIEF = {"iterations": 12, "init.points": 200, "evaluation.views": 1}
 LONG_S = 120.0
 
-# What a schema cannot say: a body that is no capture, options that are none, an image in no format that we have.
+# What a schema cannot say: a body that is no capture, options that are none, numbers with commas between them, a view
+# of the capture, an image in no format that we have.
 FUZZ = """
 [[operations]]
-include-operation-id = ["submit_job", "plan_training", "render"]
+include-operation-id = ["submit_job", "plan_training", "inspect_capture", "render", "get_export", "get_comparison"]
 checks.positive_data_acceptance.expected-statuses = ["2xx", "3xx", 400, 401, 403, 404, 406, 409, 413, 422, 429, "5xx"]
 
 [parameters]
@@ -44,11 +45,12 @@ def test_the_published_interface_changes_only_on_purpose(client: TestClient) -> 
 
 
 @contextmanager
-def running(data: Path, *options: str) -> Iterator[str]:
-    """A service that asks for keys; yields its address."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+def running(data: Path, *options: str, port: int = 0) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A service, with its address."""
+    if port == 0:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
     command = [sys.executable, "-m", "service.commands", "--data", str(data), "--port", str(port), *options]
     environment = {**os.environ, "GRAINGS_KEY_REQUESTS": "1000000"}
     with (
@@ -66,7 +68,7 @@ def running(data: Path, *options: str) -> Iterator[str]:
                     time.sleep(0.1)
                 else:
                     break
-            yield f"http://127.0.0.1:{port}"
+            yield f"http://127.0.0.1:{port}", process
         finally:
             process.terminate()
 
@@ -83,7 +85,7 @@ def test_a_fuzzer_finds_nothing(tmp_path: Path, capture: Path, trained: Path) ->
     st = tool("st")
     data = tmp_path / "data"
     key = Keys(data / "keys").create("fuzz", Scope.ADMIN)[1]
-    with running(data) as url, Client(url, key=key) as client:
+    with running(data) as (url, _), Client(url, key=key) as client:
         job = client.submit(capture, preset="draft").id
         shutil.copytree(trained, data / "jobs" / job / "run")
         client.cancel(job)
@@ -125,7 +127,7 @@ def test_a_generated_client_trains_and_renders(tmp_path: Path, archive: bytes) -
     data, packed, image = tmp_path / "data", tmp_path / "capture.zip", tmp_path / "view.png"
     packed.write_bytes(archive)
     key = Keys(data / "keys").create("generated", Scope.TRAIN)[1]
-    with running(data, "--with-worker") as url:
+    with running(data, "--with-worker") as (url, _):
         subprocess.run(
             [generator, "generate", "--url", f"{url}/openapi.json", "--meta", "none", "--output-path", "graings_api"],
             cwd=tmp_path, check=True, capture_output=True,
