@@ -1,4 +1,4 @@
-"""The player's routes: scene files that are written once for a checkpoint, cameras, and photographs beside the model."""
+"""The player's routes: scene files written once for each checkpoint, cameras, and photographs beside the model."""
 
 from __future__ import annotations
 
