@@ -42,7 +42,9 @@ def test_a_submitted_capture_becomes_a_queued_job(client: TestClient, archive: b
     assert answer.headers["location"] == job["links"]["self"] == f"/jobs/{job['id']}"
     assert (job["state"], job["name"], job["priority"], job["attempts"]) == ("queued", "moving", 3, 0)
     assert (job["config"]["iterations"], job["config"]["loss"]["ssim"], job["config"]["preset"]) == (50, 0.1, "draft")
-    assert client.get(job["links"]["self"]).json() == job
+    later = client.get(job["links"]["self"]).json()
+    assert later["queued_s"] > job["queued_s"]
+    assert later == {**job, "queued_s": later["queued_s"]}
     assert list((settings.data / "uploads").iterdir()) == []
 
 
