@@ -2,4 +2,6 @@
 
 from graings.cli.main import main
 
-main()
+# The service reads uploads in processes that load this module again, under another name.
+if __name__ == "__main__":
+    main()

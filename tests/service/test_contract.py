@@ -51,7 +51,7 @@ def running(data: Path, *options: str, port: int = 0) -> Iterator[tuple[str, sub
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "service.commands", "--data", str(data), "--port", str(port), *options]
+    command = [sys.executable, "-m", "graings", "serve", "--data", str(data), "--port", str(port), *options]
     environment = {**os.environ, "GRAINGS_KEY_REQUESTS": "1000000"}
     with (
         subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment) as process,
