@@ -43,7 +43,7 @@ class SequenceManifest(Document):
     )
     up: tuple[float, float, float] = Field(description="The capture's vertical axis, unit length.")
     degree: int = Field(ge=0, le=3, description="Highest degree of the spherical harmonics.")
-    frames: tuple[SequenceFrame, ...]
+    frames: tuple[SequenceFrame, ...] = Field(description="The files, in order of time.")
 
 
 @dataclass(frozen=True, slots=True)

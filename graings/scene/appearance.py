@@ -212,7 +212,7 @@ class ResidualField(TemporalHead):
         count = len(directions)
         hidden = part.seeing if count == 1 else _per_row(part.seeing.values.repeat(count, 1))
         encoded = direction_encoding(torch.cat(list(directions)), self.sh_degree)
-        view_dependent = self.seeing.predict(hidden, encoded_time, encoded).view(count, len(time_only), -1, 3)
+        view_dependent = self.seeing.predict(hidden, encoded_time, encoded).view(count, *time_only.shape, 3)
         opacity = time_only.unsqueeze(-1).expand(count, -1, -1, 1)
         return torch.cat([view_dependent, opacity], dim=-1)
 

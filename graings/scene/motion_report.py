@@ -31,7 +31,9 @@ class BasisReport(Document):
 class MotionBasisReport(Document):
     """What a motion basis is and how far it is from the exact scene."""
 
-    schema_: Literal["graings.motion_basis/1"] = Field("graings.motion_basis/1", alias="schema")
+    schema_name: Literal["graings.motion_basis/1"] = Field(
+        "graings.motion_basis/1", alias="schema", description="Kind and version of this document."
+    )
 
     children: int = Field(ge=0, description="Children that some time and view may show.")
     views: int = Field(ge=0, description="Training views in which pixels are measured.")

@@ -11,10 +11,14 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from graings.ablation.experiment import Ablation
+from graings.export.export import SequenceFrame, SequenceManifest
 from graings.footage.report import FootageCamera, FootageReport
+from graings.inspection.inspect import inspect_capture
+from graings.render import PreparedScene, fast_scene
 from graings.report import events
 from graings.report.events import Event, Grew, StepSkipped
 from graings.report.folder import report_runs
+from graings.storage.compact import open_model
 from jobs.progress import ProgressReport
 from tests.ablation.tiny import SETTINGS
 
@@ -79,6 +83,9 @@ def documents(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     for _, run in experiment:
         assert list(run)
     run = folder / "full" / "seed-0"
+    model = open_model(run)
+    splats = SequenceFrame(file="0000.ply", t=0.0, capture_time=0.0, splats=9)
+    sequence = SequenceManifest(up=(0.0, 0.0, 1.0), degree=0, frames=(splats,))
     report_runs([run], run / "report", budget_s=0.0)
     files = {
         "ablation": folder / "ablation.json",
@@ -93,6 +100,9 @@ def documents(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         "progress": json.loads(REPORT.model_dump_json()),
         "event": EVENTS[0].to_json(),
         "footage": FOOTAGE.to_json(),
+        "inspection": inspect_capture(capture)[0].to_json(),
+        "motion_basis": fast_scene(PreparedScene(model.scene), model.views["train"])[1].to_json(),
+        "ply_sequence": sequence.to_json(),
     }
 
 

@@ -14,7 +14,7 @@ from graings.report.work_precision import training_part
 from graings.report.work_precision_document import TrainingPart
 from graings.storage.files import write_document
 
-VIEW = {"time": 0.5, "psnr": 30.0, "ssim_3dgs": 0.9, "lpips_vgg": None, "flip_ldr": None, "mse": 1e-3}
+VIEW = {"time": 0.5, "psnr": 30.0, "ssim_3dgs": 0.9, "lpips_vgg": None, "flip_ldr": None, "compared": 1.0, "mse": 1e-3}
 
 
 def point(train_s: float, psnr: float, *, iteration: int = 100, gaussians: int = 1000) -> EvaluationPoint:
