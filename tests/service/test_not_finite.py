@@ -53,7 +53,8 @@ def test_no_metric_can_be_stored_that_is_not_finite(trained: Path, bad: float) -
 def test_a_report_that_is_not_finite_becomes_null_on_its_way_out(
     client: TestClient, job: str, folder: JobFolder, bad: float
 ) -> None:
-    numbers = [name for name, field in ProgressReport.model_fields.items() if "float" in str(field.annotation)]
+    kinds = {name: str(field.annotation) for name, field in ProgressReport.model_fields.items()}
+    numbers = [name for name, kind in kinds.items() if "float" in kind and "dict" not in kind]
     assert len(numbers) > 5
     writer = ProgressWriter(folder.progress)
     report = {"phase": "joint", "iteration": 1, "iterations": 9, "attempt": 1, **dict.fromkeys(numbers, bad)}
