@@ -34,7 +34,8 @@ def trainer(folder: JobFolder) -> subprocess.Popen[bytes]:
 def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_path: Path) -> None:
     store = Store(tmp_path)
     folder = job(store)
-    next((store.capture("0" * 64) / "train").glob("*.png")).unlink()
+    image = next((store.capture("0" * 64) / "train").glob("*.png"))
+    image.write_bytes(image.read_bytes()[:-20])
     with trainer(folder) as process:
         assert process.stdout is not None
         output = process.stdout.read()  # its standard input stays open: closing it would stop the trainer
