@@ -21,6 +21,9 @@ from graings.storage.model import Model
 
 SEQUENCE: Final = "zip"
 MODEL: Final = "graings"
+SCENE: Final = "scene.gz"  # for the player (graings.player)
+PAGE: Final = "html"  # the player with its scene
+WHOLE: Final = (MODEL, SCENE, PAGE)  # formats with all times, which have no splats to choose
 FORMATS: Final = (*WRITERS, SEQUENCE)
 FRAMES: Final = 30
 MAX_FRAMES: Final = 10_000
@@ -82,9 +85,9 @@ class Exported:
 
 def export_format(path: Path) -> str:
     """The format that the name of `path` asks for. Raises `ValueError` with the list of those that are written."""
-    found = suffix_of(path, (*FORMATS, MODEL))
+    found = suffix_of(path, (*FORMATS, *WHOLE))
     if found is None:
-        known = ", ".join(f".{name}" for name in (*FORMATS, MODEL))
+        known = ", ".join(f".{name}" for name in (*FORMATS, *WHOLE))
         raise ValueError(f"{path.name}: files of this kind are not written, choose one of {known}")
     return found
 

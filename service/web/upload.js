@@ -5,7 +5,7 @@ import { request } from "./requests.js";
 import { filesOf, tar } from "./tar.js";
 
 const $ = (id) => document.getElementById(id);
-const PROMPT = "Drop a capture here: a folder, or a zip or tar file";
+const PROMPT = "Drop a capture here: a folder, a zip or tar file, or a video";
 
 /** @param {(id: string) => void} submitted gets the id of a new job */
 export function uploadForm(submitted) {

@@ -1,0 +1,90 @@
+"""A headless Chromium, with WebGL2 in software, and pages that fail their test for whatever they should not do.
+
+Chromium is the one of the system: `chromium`, `chromium-browser` or `google-chrome`. Without it, or without playwright,
+the tests of this folder are skipped. All are slow: drawing without a GPU takes a tenth of a second for each picture.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.service.conftest import archive, capture  # noqa: F401
+from tests.service.test_commands import LONG_S, readiness
+
+playwright = pytest.importorskip("playwright.sync_api")
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+# Without a sandbox, which needs privileges that containers do not have; the pages are our own.
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+WAIT_MS = 120_000
+
+OpenPage = Callable[..., Any]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.slow(reason="draws in a browser without a GPU"))
+            if CHROMIUM is None:
+                item.add_marker(pytest.mark.skip(reason="needs a browser: apt-get install chromium"))
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        running = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[OpenPage]:
+    """Opens pages. In the end it fails where one had an error, or sent a request to another place than its own."""
+    problems: list[str] = []
+    contexts: list[Any] = []
+
+    def opened(address: str, **context: Any) -> Any:
+        contexts.append(browser.new_context(**context))
+        page = contexts[-1].new_page()
+        page.set_default_timeout(WAIT_MS)
+        page.on("console", lambda message: message.type in ("error", "warning") and problems.append(message.text))
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        file = address.startswith("file:")
+        own = (address.split("#")[0] if file else "/".join(address.split("/")[:3]), "blob:")
+        page.on("request", lambda sent: sent.url.startswith((*own, "data:")) or problems.append(sent.url))
+        page.goto(address)
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert problems == []
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a service with a worker, as processes of their own."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    data = tmp_path_factory.mktemp("data")
+    command = [sys.executable, "-m", "service.commands", "--with-worker", "--data", str(data), "--port", str(port)]
+    deadline = time.monotonic() + 3 * LONG_S
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        try:
+            while readiness(port).get("workers") != 1:
+                assert process.poll() is None
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            process.terminate()
