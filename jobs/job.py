@@ -140,6 +140,7 @@ class Job:
     progress: ProgressReport | None
     checkpoint: int | None
     has_metrics: bool
+    has_curve: bool
     has_plan: bool
     has_model: bool
     error: str | None

@@ -194,6 +194,7 @@ class JobQueue:
             progress=last_progress(folder.progress),
             checkpoint=folder.checkpoint(),
             has_metrics=folder.metrics.exists(),
+            has_curve=folder.curve.exists(),
             has_plan=folder.plan.exists(),
             has_model=folder.model.exists(),
             error=error,

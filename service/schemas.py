@@ -99,7 +99,9 @@ def job_summary(job: Job) -> JobSummary:
     if job.has_plan:
         links["plan"] = f"{base}/plan"
     if job.has_metrics:
-        links |= {"metrics": f"{base}/metrics", "curve": f"{base}/curve.svg", "report": f"{base}/report"}
+        links |= {"metrics": f"{base}/metrics", "report": f"{base}/report"}
+    if job.has_curve:  # training draws it less often than it writes metrics
+        links["curve"] = f"{base}/curve.svg"
     if job.has_model:
         links["model"] = f"{base}/model"
     same = ("id", "state", "created_at", "started_at", "finished_at", "attempts", "progress", "checkpoint", "error")

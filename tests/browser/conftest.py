@@ -56,7 +56,10 @@ def open_page(browser: Any) -> Iterator[OpenPage]:
         contexts.append(browser.new_context(**context))
         page = contexts[-1].new_page()
         page.set_default_timeout(WAIT_MS)
-        page.on("console", lambda message: message.type in ("error", "warning") and problems.append(message.text))
+        page.on(
+            "console",
+            lambda said: said.type in ("error", "warning") and problems.append(f"{said.text} {said.location['url']}"),
+        )
         page.on("pageerror", lambda error: problems.append(str(error)))
         file = address.startswith("file:")
         own = (address.split("#")[0] if file else "/".join(address.split("/")[:3]), "blob:")

@@ -67,15 +67,14 @@ def test_the_player_shows_what_the_server_renders(service: str, job: str, open_p
     page = open_page(f"{service}/#job={job}", viewport={"width": 1200, "height": 900})
     page.locator("#player[data-ready]").wait_for()
     found = []
-    for name in ("train:0", "train:3", "val:0"):
+    for name in ("train:0", "train:2", "train:4"):  # colours are fitted to training views, here six
         page.get_by_label("Camera").select_option(name)
         for time in ("0", "0.37", "1"):
             page.get_by_role("slider", name="Time").fill(time)
-            with page.expect_response(re.compile("/render")) as answer:
-                pass
-            page.wait_for_timeout(500)
+            page.locator(".stage img:not(.shown)").wait_for(state="attached")
+            page.locator(".stage img.shown").wait_for()
+            page.wait_for_timeout(500)  # it fades in
             exact = page.locator(".stage").screenshot()
-            assert answer.value.status == 200
             page.evaluate(HIDE_EXACT)
             page.wait_for_timeout(100)
             drawn = page.locator(".stage").screenshot()
@@ -83,7 +82,7 @@ def test_the_player_shows_what_the_server_renders(service: str, job: str, open_p
             found.append(psnr(picture(drawn, tmp_path), picture(exact, tmp_path)))
             assert np.std(picture(drawn, tmp_path)) > 0.02
     # The exact picture is a WebP of lower quality, which limits this; tests/browser/test_player.py compares pixels.
-    assert min(found) > 35, found
+    assert min(found) > 38, [round(value, 1) for value in found]
 
 
 def test_a_link_of_the_page_restores_job_view_and_time(service: str, job: str, open_page: OpenPage) -> None:
@@ -100,18 +99,16 @@ def test_a_link_of_the_page_restores_job_view_and_time(service: str, job: str, o
     assert other.evaluate("location.href") == address
 
 
-def test_a_held_out_photograph_beside_the_model(service: str, job: str, open_page: OpenPage) -> None:
+def test_a_held_out_photograph_beside_the_model(service: str, job: str, open_page: OpenPage, tmp_path: Path) -> None:
     page = open_page(f"{service}/#job={job}")
     page.locator("#comparison summary").click()
     page.locator("#quality", has_text="dB after").wait_for()
     shown = page.locator("#quality").text_content()
     answer = httpx2.get(f"{service}/jobs/{job}/comparison", params={"camera": page.locator("#held").input_value()})
     assert shown == f"{answer.headers['x-graings-psnr']} dB after {ITERATIONS} iterations"
-    size = oiio.ImageInput.open("x.png", oiio.ImageSpec(), oiio.IOMemReader(answer.content)).spec()
-    assert page.locator("#pictures canvas").first.evaluate("canvas => [canvas.width, canvas.height]") == [
-        size.width // 3,
-        size.height,
-    ]
+    height, width, _ = picture(answer.content, tmp_path).shape
+    canvas = page.locator("#pictures canvas").first
+    assert canvas.evaluate("canvas => [canvas.width, canvas.height]") == [width // 3, height]
 
 
 def test_without_webgl_the_server_draws(service: str, job: str, browser: Any) -> None:
