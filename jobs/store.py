@@ -168,6 +168,11 @@ class Store:
         """The folder with the files of a capture."""
         return capture_root(self._captures / digest)
 
+    def trained_on(self, job_id: str) -> Path:
+        """The folder of the capture of a job: its upload, or what was made of a video or of photographs."""
+        folder = self.folder(job_id)
+        return folder.capture if folder.capture.is_dir() else self.capture(folder.spec().capture)
+
     def create(self, spec: JobSpec, unpacked: Path | None, key: str | None = None) -> str:
         """Add a job whose capture is in the folder `unpacked`, which is moved into the store; None: one it has.
 

@@ -6,10 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from graings.cli.terminal import print_line
+from graings.cli.terminal import print_line, task_progress
 from graings.footage.make_capture import make_capture
 from graings.footage.report import lines
 from graings.kernel.threads import usable_cores
@@ -24,9 +22,7 @@ def capture(
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads (default: all usable cores).")] = None,
 ) -> None:
     """Find the cameras of a video or of photographs, and write a capture that `graings train` reads."""
-    console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, expand=True, disable=not console.is_terminal) as bar:
+    with task_progress() as bar:
         tasks = {}
 
         def observe(phase: str, done: int, total: int) -> None:

@@ -7,13 +7,12 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
 from graings.capture.synthetic import SUITE
 from graings.capture.synthetic import synthesize as write_scene
-from graings.cli.terminal import print_line
+from graings.cli.terminal import print_line, task_progress
 from graings.kernel.threads import usable_cores
 
 
@@ -37,9 +36,7 @@ def synthesize(
         raise typer.BadParameter("name a scene, or give --list", param_hint="NAME")
     if output is None:
         raise typer.BadParameter("name the folder to write", param_hint="--output")
-    console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, expand=True, disable=not console.is_terminal) as bar:
+    with task_progress() as bar:
         task = bar.add_task("rendering", total=None)
         try:
             write_scene(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.status import Status
 from rich.text import Text
 
@@ -13,6 +14,13 @@ from graings.evaluation.motion import MotionMetrics
 def print_line(text: str) -> None:
     """Print a line without markup and wrapping."""
     Console().print(Text(text), soft_wrap=True)
+
+
+def task_progress() -> Progress:
+    """A bar with count and time left for each task, as a context; nothing is shown where there is no terminal."""
+    console = Console()
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, expand=True, disable=not console.is_terminal)
 
 
 def busy_status(text: str) -> Status:

@@ -7,12 +7,10 @@ from time import perf_counter
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.cli.rendering import RenderPath
-from graings.cli.terminal import print_line
+from graings.cli.terminal import print_line, task_progress
 from graings.cli.training import Threads
 from graings.export.camera_path import ORBIT, Moves, frames_of
 from graings.export.shown import UP, open_shown
@@ -76,10 +74,8 @@ def video(
         frames = frames_of(shown, request, path, moves, max(1, round(seconds * fps)))
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
-    console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), MofNCompleteColumn(), TimeRemainingColumn())
     started = perf_counter()
-    with Progress(*columns, console=console, expand=True, disable=not console.is_terminal) as bar:
+    with task_progress() as bar:
         task = bar.add_task("rendering", total=len(frames))
         write_video(output, shown, frames, rgb, fps=fps, observe=lambda done: bar.update(task, completed=done))
     elapsed = perf_counter() - started

@@ -1,14 +1,17 @@
 """make_capture: a capture from a video or a folder of photographs without poses.
 
 Frames, camera poses, undistorted images and first points, in the single-file layout of nerfstudio. What is done so far
-lies in `.footage` of the capture's folder; a call that was interrupted continues there.
+lies in `.footage` of the capture's folder: a call that was interrupted continues there, and one that asks for other
+frames begins again.
 """
 
 from __future__ import annotations
 
+import fcntl
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,10 +20,10 @@ import numpy as np
 from graings.colmap import import_pycolmap
 from graings.document import read_document
 from graings.errors import CaptureError
-from graings.footage.frame_document import FootageFrames
+from graings.footage.frame_document import FootageFrames, FrameRequest
 from graings.footage.photos import convert_photographs, photographs
 from graings.footage.poses import reconstruct
-from graings.footage.registration import MIN_TRACK, measure, refuse_unusable, upright
+from graings.footage.registration import MIN_TRACK, check_usable, measure, nothing_registered, upright
 from graings.footage.report import REPORT_FILE, FootageReport
 from graings.footage.sharpness import blurred
 from graings.footage.video import extract_frames
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 WORKSPACE: Final = ".footage"
+LOCK_FILE: Final = ".lock"
 TRANSFORMS: Final = "transforms.json"
 POINTS: Final = "points.ply"
 
@@ -51,29 +55,41 @@ def make_capture(
     Of a video at most `frames` frames are taken, of a folder all photographs; images have no side above `max_side` px.
     A `static` capture has no times. `observe` is called with the phase, what is done of it and its total. Raises
     `CaptureError` where the source cannot be read, where its frames do not fit together, and for a `target` that holds
-    a capture.
+    a capture, was begun with another source, or is being written by another process.
     """
     if not source.exists():
         raise CaptureError("does not exist", file=source, remedy="Give a video or a folder of photographs.")
     if (target / TRANSFORMS).exists():
         raise CaptureError("holds a capture already", file=target, remedy="Choose another folder.")
     workspace = target / WORKSPACE
-    (workspace / "frames").mkdir(parents=True, exist_ok=True)
+    workspace.mkdir(parents=True, exist_ok=True)
+    with _sole(workspace):
+        report = _make(source, target, _request(source, frames, max_side), static, threads, observe)
+        shutil.rmtree(workspace)
+    return report
+
+
+def _make(
+    source: Path, target: Path, request: FrameRequest, static: bool, threads: int, observe: Observe
+) -> FootageReport:
+    workspace = target / WORKSPACE
     seconds: dict[str, float] = {}
     observe_timed = _timed(observe, seconds)
 
-    taken = _frames(source, workspace, frames, max_side, observe_timed)
+    taken = _frames(source, workspace, request, observe_timed)
     names = [frame.name for frame in taken.frames]
     model = reconstruct(workspace / "frames", names, workspace, threads, observe_timed)
-    found = refuse_unusable(None if model is None else measure(model), len(names), source)
-    assert model is not None
+    if model is None:
+        raise nothing_registered(len(names), source)
+    found = measure(model)
+    check_usable(found, len(names), source)
     observe_timed("undistortion", 0, 1)
     times = {} if static else {frame.name: frame.time for frame in taken.frames}
     _write_capture(model, workspace, target, times)
     observe_timed("undistortion", 1, 1)
     registered = [times[name] for name in found.names if name in times]
     report = FootageReport(
-        source=taken.source,
+        source=request.source,
         seen=taken.seen,
         taken=len(names),
         registered=len(found.names),
@@ -90,7 +106,6 @@ def make_capture(
         seconds=seconds,
     )
     write_document(target / REPORT_FILE, report)
-    shutil.rmtree(workspace)
     return report
 
 
@@ -108,30 +123,58 @@ def _timed(observe: Observe, seconds: dict[str, float]) -> Observe:
     return note
 
 
-def _frames(source: Path, workspace: Path, count: int, max_side: int, observe: Observe) -> FootageFrames:
-    """The frames in the workspace: those of an earlier call, or new ones."""
+def _frames(source: Path, workspace: Path, request: FrameRequest, observe: Observe) -> FootageFrames:
+    """The frames in the workspace: those of an earlier call that asked for the same, or new ones."""
     record = workspace / "frames.json"
     if record.exists():
         known = read_document(record, FootageFrames, f"Delete {workspace} to begin again.")
-        if known.source != source.name:
+        if known.request.source != request.source:
             remedy = f"Give that one, or delete {workspace}."
-            raise CaptureError(f"was begun with {known.source}, not {source.name}", file=workspace, remedy=remedy)
-        return known
-    target, notes = workspace / "frames", tuple[str, ...]()
+            problem = f"was begun with {known.request.source}, not {request.source}"
+            raise CaptureError(problem, file=workspace, remedy=remedy)
+        if known.request == request:
+            return known
+    # Features and matches of other frames would be taken for those of the new ones.
+    for content in workspace.iterdir():
+        if content.name != LOCK_FILE:
+            shutil.rmtree(content) if content.is_dir() else content.unlink()
+    target = workspace / "frames"
+    target.mkdir()
+    blurry, notes = tuple[str, ...](), tuple[str, ...]()
     if source.is_dir():
         photos = photographs(source)
         if not photos:
             raise CaptureError("holds no photographs", file=source, remedy="Give a video or a folder of photographs.")
         seen = len(photos)
-        frames, notes = convert_photographs(photos, target, max_side, lambda d, n: observe("frames", d, n))
+        frames, notes = convert_photographs(photos, target, request.max_side, lambda d, n: observe("frames", d, n))
     else:
-        seen, frames = extract_frames(source, target, count, max_side, lambda d, n: observe("frames", d, n))
-    unsharp = blurred([frame.sharpness for frame in frames])
-    kept = tuple(frame for frame, out in zip(frames, unsharp, strict=True) if not out)
-    left_out = tuple(frame.name for frame, out in zip(frames, unsharp, strict=True) if out)
-    document = FootageFrames(source=source.name, seen=seen, frames=kept, blurred=left_out, notes=notes)
+        side, count = request.max_side, request.count
+        seen, frames = extract_frames(source, target, count, side, lambda d, n: observe("frames", d, n))
+        # Neighbours of a video show the same: who is less sharp is blurred. Photographs may show anything.
+        unsharp = blurred([frame.sharpness for frame in frames])
+        blurry = tuple(frame.name for frame, out in zip(frames, unsharp, strict=True) if out)
+    kept = tuple(frame for frame in frames if frame.name not in blurry)
+    document = FootageFrames(request=request, seen=seen, frames=kept, blurred=blurry, notes=notes)
     write_document(record, document)
     return document
+
+
+def _request(source: Path, count: int, max_side: int) -> FrameRequest:
+    files = [(path.name, path.stat()) for path in (photographs(source) if source.is_dir() else [source])]
+    listed = tuple((name, stat.st_size, stat.st_mtime_ns) for name, stat in files)
+    return FrameRequest(source=source.name, files=listed, count=count, max_side=max_side)
+
+
+@contextmanager
+def _sole(workspace: Path) -> Iterator[None]:
+    """Lock a workspace for one call. Raises `CaptureError` when another process of this machine has the lock."""
+    with (workspace / LOCK_FILE).open("a") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            remedy = "Wait for it, or choose another folder."
+            raise CaptureError("is being written by another process", file=workspace.parent, remedy=remedy) from error
+        yield
 
 
 def _write_capture(model: pycolmap.Reconstruction, workspace: Path, target: Path, times: dict[str, float]) -> None:

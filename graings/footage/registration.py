@@ -28,7 +28,7 @@ MIN_PARALLAX: Final = 2.0
 
 MIN_TRACK: Final = 3
 MAX_POINTS_MEASURED: Final = 2_000
-DRIFT_REMEDY: Final = "Walk sideways around the subject while recording, so that near things move against far ones."
+PARALLAX_REMEDY: Final = "Walk sideways around the subject while recording, so that near things move against far ones."
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,20 +76,22 @@ def measure(model: pycolmap.Reconstruction) -> Registration:
     )
 
 
-def refuse_unusable(found: Registration | None, taken: int, source: Path) -> Registration:
-    """`found`, or `CaptureError` saying what is wrong with it and how to record instead."""
-    if found is None:
-        remedy = "Record slowly, with overlap between frames and texture in view, or take more frames (--frames)."
-        raise CaptureError(f"none of {taken} frames could be registered", file=source, remedy=remedy)
+def nothing_registered(taken: int, source: Path) -> CaptureError:
+    """The error for frames that do not fit together at all."""
+    remedy = "Record slowly, with overlap between frames and texture in view, or take more frames (--frames)."
+    return CaptureError(f"none of {taken} frames could be registered", file=source, remedy=remedy)
+
+
+def check_usable(found: Registration, taken: int, source: Path) -> None:
+    """Raise `CaptureError` where no capture can be made of it, saying what is wrong and how to record instead."""
     count = len(found.names)
     registered = f"registered {count} of {taken} frames"
     if found.parallax < MIN_PARALLAX:
         problem = f"{registered}; the camera hardly moves: points are seen over {found.parallax:.1f} degrees"
-        raise CaptureError(problem, file=source, remedy=DRIFT_REMEDY)
+        raise CaptureError(problem, file=source, remedy=PARALLAX_REMEDY)
     if count < max(MIN_FRAMES, MIN_SHARE * taken):
         remedy = "Record slowly with more overlap, take more frames (--frames), or cut the clip to one continuous shot."
         raise CaptureError(f"{registered}, too few for the clip", file=source, remedy=remedy)
-    return found
 
 
 def upright(model: pycolmap.Reconstruction) -> Array:

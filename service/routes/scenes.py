@@ -84,8 +84,8 @@ async def comparison(
 ) -> Response:
     """A photograph, the newest model from its camera, and their difference (5 times), side by side."""
     loaded = await to_thread.run_sync(_loaded, context, job_id)
-    spec = await to_thread.run_sync(context.store.folder(job_id).spec)
-    found = await compare(context.store.capture(spec.capture), loaded, camera)
+    capture = await to_thread.run_sync(context.store.trained_on, job_id)
+    found = await compare(capture, loaded, camera)
     headers = {
         "Cache-Control": "private, no-cache",
         "X-Graings-PSNR": f"{found.psnr:.2f}",

@@ -16,7 +16,8 @@ from graings.errors import CaptureError
 from graings.footage.make_capture import WORKSPACE, make_capture
 from graings.footage.poses import pairs
 from graings.footage.report import REPORT_FILE, FootageReport, lines
-from tests.footage.clips import FPS, encode, film
+from graings.image_encoding import encode_image
+from tests.footage.clips import FPS, encode, film, read_png
 
 pytest.importorskip("av")
 pytest.importorskip("pycolmap")
@@ -121,6 +122,48 @@ def test_frames_that_have_nothing_in_common_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"none of 10 frames could be registered.*overlap"):
         make_capture(encode(tmp_path / "a.mp4", noise), tmp_path / "c", frames=10)
     assert not (tmp_path / "c" / "transforms.json").exists()
+
+
+def test_a_call_for_other_frames_begins_again_as_the_remedy_of_a_refusal_says(tmp_path: Path) -> None:
+    noise = [np.random.default_rng(seed).integers(0, 256, (64, 64, 3), dtype=np.uint8) for seed in range(12)]
+    video = encode(tmp_path / "a.mp4", noise)
+    for count in (4, 12, 6):
+        with pytest.raises(CaptureError, match=rf"none of {count} frames"):
+            make_capture(video, tmp_path / "c", frames=count)
+    with pytest.raises(CaptureError, match="none of 6 frames"):
+        make_capture(video, tmp_path / "c", frames=6, max_side=32)
+    first = read_png(tmp_path / "c" / WORKSPACE / "frames" / "00000.png")
+    assert first.shape[:2] == (32, 32)
+    encode(video, noise[:5])  # the same name with other content
+    with pytest.raises(CaptureError, match="none of 5 frames"):
+        make_capture(video, tmp_path / "c", frames=6, max_side=32)
+
+
+def test_two_calls_at_once_for_one_folder_are_refused(tmp_path: Path) -> None:
+    noise = [np.random.default_rng(seed).integers(0, 256, (64, 64, 3), dtype=np.uint8) for seed in range(8)]
+    video = encode(tmp_path / "a.mp4", noise)
+    refused = []
+
+    def second(phase: str, done: int, total: int) -> None:
+        with pytest.raises(CaptureError, match="written by another process"):
+            make_capture(video, tmp_path / "c", frames=8)
+        refused.append(phase)
+
+    with pytest.raises(CaptureError, match="none of 8 frames"):
+        make_capture(video, tmp_path / "c", frames=8, observe=second)
+    assert "matching" in refused
+
+
+def test_photographs_of_different_sharpness_are_all_taken(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for index in range(9):
+        image = np.full((64, 64, 3), 0.5, np.float32)
+        if index != 4:
+            image = np.random.default_rng(index).random((64, 64, 3), dtype=np.float32)
+        (folder / f"{index}.png").write_bytes(encode_image(image))
+    with pytest.raises(CaptureError, match="none of 9 frames"):
+        make_capture(folder, tmp_path / "c")
 
 
 def test_a_missing_source_and_an_empty_folder_are_named(tmp_path: Path) -> None:

@@ -36,6 +36,14 @@ def test_a_job_comes_back_as_it_was_stored(tmp_path: Path) -> None:
     assert list(store.uploads.iterdir()) == []
 
 
+def test_a_job_on_a_video_is_trained_on_the_capture_that_was_made_of_it(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    job_id = store.create(spec(), unpacked(store, "u", "video.mp4"))
+    assert store.trained_on(job_id) == store.capture(DIGEST)
+    store.folder(job_id).capture.mkdir()
+    assert store.trained_on(job_id) == store.folder(job_id).capture
+
+
 def test_newer_jobs_come_first(tmp_path: Path) -> None:
     store = Store(tmp_path)
     ids = [store.create(spec(str(i)), unpacked(store, "u", "a.json")) for i in range(4)]
