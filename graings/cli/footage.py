@@ -30,15 +30,19 @@ def capture(
                 tasks[phase] = bar.add_task(phase, total=total)
             bar.update(tasks[phase], completed=done, total=total)
 
-        report = make_capture(
-            source,
-            output,
-            frames=frames,
-            max_side=max_side,
-            static=static,
-            threads=threads or usable_cores(),
-            observe=observe,
-        )
+        try:
+            report = make_capture(
+                source,
+                output,
+                frames=frames,
+                max_side=max_side,
+                static=static,
+                threads=threads or usable_cores(),
+                observe=observe,
+            )
+        except KeyboardInterrupt:
+            print_line(f"Interrupted. The same command continues from what is done in {output}.")
+            raise
     for line in lines(report):
         print_line(line)
     print_line(f"Written to {output}. Next: graings train {output} --output RUN.")
