@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
+from graings.errors import CaptureError
 from graings.footage.make_capture import TRANSFORMS, make_capture
 from graings.footage.report import lines
 from graings.footage.source import find_footage
@@ -46,5 +47,9 @@ def capture_of(
         if stop.is_set():
             raise Stopped
 
-    report = make_capture(footage, folder.capture, threads=threads, observe=observe)
+    try:
+        report = make_capture(footage, folder.capture, threads=threads, observe=observe)
+    except CaptureError as error:
+        # Its client knows the names of the files, and nothing of the folders of this machine.
+        raise CaptureError(error.problem, file=Path(error.file).name, field=error.field, remedy=error.remedy) from error
     return folder.capture, lines(report)

@@ -43,7 +43,8 @@ def test_a_video_whose_frames_do_not_fit_together_fails_with_the_reason_and_the_
         output = process.stdout.read()
         assert process.wait(120) == ExitCode.REFUSED
     message = json.loads(output)["error"]
-    assert "video.mp4" in message
+    assert message.startswith("video.mp4: ")  # and nothing of the folders of the service
+    assert str(tmp_path) not in message
     assert "could be registered" in message
     report = last_progress(folder.progress)
     assert report is not None
