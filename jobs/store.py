@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import shutil
 import time
@@ -40,11 +39,7 @@ from jobs.job import (
 )
 from jobs.locks import locked
 
-LOG = logging.getLogger(__name__)
-
 KEPT_ATTEMPTS = 50
-# An upload without a write for so long belongs to a process that died.
-LEFTOVER_S = 3_600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,35 +255,6 @@ class Store:
 def _read_spec(file: str, modified_ns: int) -> JobSpec:
     """The specification in a file, which is read again only after it was written again."""
     return JobSpec(**json.loads(Path(file).read_text())["spec"])
-
-
-def discard_leftovers(uploads: Path) -> None:
-    """Remove the uploads of processes that died; uploads of running processes stay.
-
-    A file that cannot be removed is only logged, so that it does not prevent the next upload.
-    """
-    # The archive and the folder of one upload share a name. While unpacking, only the folder is written.
-    groups: dict[str, list[Path]] = {}
-    for path in uploads.iterdir():
-        groups.setdefault(path.name.partition(".")[0], []).append(path)
-    for paths in groups.values():
-        try:
-            if time.time() - max(_last_write(path) for path in paths) < LEFTOVER_S:
-                continue
-            for path in paths:
-                if path.is_dir():
-                    shutil.rmtree(path)
-                else:
-                    path.unlink()
-        except FileNotFoundError:
-            continue  # removed by another process meanwhile
-        except OSError as error:
-            LOG.warning("an abandoned upload cannot be removed: %s", error)
-
-
-def _last_write(path: Path) -> float:
-    """Unix seconds of the last change to the file, or to anything in the folder. Raises `FileNotFoundError`."""
-    return max(item.lstat().st_mtime for item in (path, *path.rglob("*")))
 
 
 def capture_root(folder: Path) -> Path:

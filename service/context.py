@@ -10,8 +10,9 @@ from fastapi import Depends, Path, Request
 
 from jobs.engine import Engine
 from jobs.lease import Leases, open_leases
+from jobs.leftovers import discard_leftovers
 from jobs.queue import JobQueue
-from jobs.store import Store, discard_leftovers
+from jobs.store import Store
 from service.archives import Limits
 from service.keys import Keys
 from service.rendering import ModelCache, RenderPool

@@ -20,7 +20,7 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.requests import Request
 
 from graings.footage.source import video_suffix
-from jobs.store import discard_leftovers
+from jobs.leftovers import discard_leftovers
 from service.archives import Limits, unpack
 from service.problems import BadRequest
 

@@ -10,8 +10,9 @@ import pytest
 
 from jobs.exit_code import ExitCode
 from jobs.job import JobConflict, JobDamaged, JobNotFound, JobSpec
+from jobs.leftovers import LEFTOVER_S, discard_leftovers
 from jobs.locks import locked
-from jobs.store import LEFTOVER_S, Store, discard_leftovers
+from jobs.store import Store
 
 DIGEST = "ab" * 32
 
