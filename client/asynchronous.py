@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -124,6 +125,28 @@ class AsyncClient:
     async def extend(self, job_id: str, iterations: int) -> RemoteJob:
         """Train a job that has succeeded for so many more iterations."""
         return await self._do(calls.extend(job_id, iterations))
+
+    async def evaluate(self, job_id: str, split: str = "test") -> dict[str, Any]:
+        """The metrics of a job that has ended, with those of the views of `split`; waits for them."""
+        task = await self._finished(await self._do(calls.evaluate(job_id, split)))
+        content: bytes = await self._do(calls.linked(task, "metrics"))
+        metrics: dict[str, Any] = json.loads(content)
+        return metrics
+
+    async def video(self, job_id: str, path: Path | str, **options: Any) -> Path:
+        """Have a video made and write it to `path`, whose suffix is its format; waits for it.
+
+        `options` are the fields of the body of `POST /jobs/{id}/videos`, such as seconds=4, moves="time", width=400.
+        """
+        call, body = calls.make_video(job_id, path, options)
+        task = await self._finished(await self._do(call, iter((body,))))
+        return calls.save(await self._do(calls.linked(task, "video")), path)
+
+    async def _finished(self, task: dict[str, Any]) -> dict[str, Any]:
+        while not calls.finished(task):
+            await asyncio.sleep(calls.POLL_S)
+            task = await self._do(calls.task(task))
+        return task
 
     async def delete(self, job_id: str) -> None:
         await self._do(calls.delete(job_id))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -124,6 +125,28 @@ class Client:
     def extend(self, job_id: str, iterations: int) -> RemoteJob:
         """Train a job that has succeeded for so many more iterations."""
         return self._do(calls.extend(job_id, iterations))
+
+    def evaluate(self, job_id: str, split: str = "test") -> dict[str, Any]:
+        """The metrics of a job that has ended, with those of the views of `split`; waits for them."""
+        task = self._finished(self._do(calls.evaluate(job_id, split)))
+        content: bytes = self._do(calls.linked(task, "metrics"))
+        metrics: dict[str, Any] = json.loads(content)
+        return metrics
+
+    def video(self, job_id: str, path: Path | str, **options: Any) -> Path:
+        """Have a video made and write it to `path`, whose suffix is its format; waits for it.
+
+        `options` are the fields of the body of `POST /jobs/{id}/videos`, such as seconds=4, moves="time", width=400.
+        """
+        call, body = calls.make_video(job_id, path, options)
+        task = self._finished(self._do(call, iter((body,))))
+        return calls.save(self._do(calls.linked(task, "video")), path)
+
+    def _finished(self, task: dict[str, Any]) -> dict[str, Any]:
+        while not calls.finished(task):
+            time.sleep(calls.POLL_S)
+            task = self._do(calls.task(task))
+        return task
 
     def delete(self, job_id: str) -> None:
         self._do(calls.delete(job_id))

@@ -18,6 +18,7 @@ Query = Mapping[str, Any]
 
 TIMEOUT = httpx2.Timeout(120.0, connect=10.0)  # an image of a large scene, or the inspection of a large capture
 RECONNECT_S = 1.0
+POLL_S = 0.5
 PATIENCE_S = 60.0  # a service that restarts is back sooner
 ATTEMPTS = 6
 RESULTS = ("model", "metrics", "plan", "report", "log", "curve.svg", "report.svg")
@@ -83,6 +84,33 @@ def change(job_id: str, verb: str) -> Call[RemoteJob]:
 
 def extend(job_id: str, iterations: int) -> Call[RemoteJob]:
     return Call("POST", f"/jobs/{job_id}/extend", _job, {"iterations": iterations})
+
+
+def evaluate(job_id: str, split: str) -> Call[dict[str, Any]]:
+    return Call("POST", f"/jobs/{job_id}/evaluate", _json, {"split": split})
+
+
+def make_video(job_id: str, path: Path | str, options: Query) -> tuple[Call[dict[str, Any]], bytes]:
+    """The request for a video in the format that the file's name asks for, and its body."""
+    body = json.dumps({"format": Path(path).suffix.lower().removeprefix("."), **options}).encode()
+    return Call("POST", f"/jobs/{job_id}/videos", _json, headers={"Content-Type": "application/json"}), body
+
+
+def linked(task: dict[str, Any], name: str) -> Call[bytes]:
+    """What a task links to."""
+    return Call("GET", task["links"][name], _content)
+
+
+def task(task: dict[str, Any]) -> Call[dict[str, Any]]:
+    """The same task now."""
+    return Call("GET", task["links"]["self"], _json)
+
+
+def finished(task: dict[str, Any]) -> bool:
+    """Whether a task has succeeded. Raises `ClientError` if it ended otherwise."""
+    if task["state"] in ("failed", "cancelled"):
+        raise ClientError(task["error"] or "The task was cancelled.")
+    return bool(task["state"] == "succeeded")
 
 
 def delete(job_id: str) -> Call[None]:

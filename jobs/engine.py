@@ -25,6 +25,7 @@ from jobs.job import JobConflict, JobState, Outcome
 QUEUE = "train"
 WORKFLOW = "train"
 MESSAGES = "messages"  # the queue and the workflow of webhooks
+TASKS = "tasks"  # those of evaluations and videos
 APPLICATION = "graings"
 # The version of the workflow's steps, not of the program: DBOS gives an interrupted job only to workers of the same
 # version. Increase it only when the steps change.
@@ -39,6 +40,7 @@ _CONNECTION_ERRORS = (
     psycopg.OperationalError,
     dbos_error.DBOSQueryTimeoutError,
 )
+_QUEUES = (QUEUE, MESSAGES, TASKS)  # their workflows have the same names
 _STATES = {
     "DELAYED": JobState.QUEUED,
     "ENQUEUED": JobState.QUEUED,
@@ -109,6 +111,12 @@ class Engine:
         with self._connection_errors():
             self._client.enqueue(options, message_id, job_id, content, attempt)
 
+    def enqueue_task(self, task: str, job_id: str, number: str) -> None:
+        """Put the task `number` of a job in the queue, as the entry `task`."""
+        options: EnqueueOptions = {"workflow_name": TASKS, "queue_name": TASKS, "workflow_id": task}
+        with self._connection_errors():
+            self._client.enqueue(options, job_id, number)
+
     def entries(self, job_ids: Sequence[str]) -> dict[str, QueueEntry]:
         """The entries of these jobs by id, without those that are not in the queue."""
         if not job_ids:
@@ -125,16 +133,22 @@ class Engine:
         """How many jobs wait for a worker."""
         return len(self._in_state("ENQUEUED"))
 
-    def delivering(self) -> dict[str, str | None]:
-        """The worker of each message that is being delivered, also those of workers that died."""
-        return {status.workflow_id: status.executor_id for status in self._in_state("PENDING", MESSAGES)}
+    def at_work(self) -> set[str]:
+        """The workers that have taken anything from the queue, also those that died."""
+        statuses = [status for name in _QUEUES for status in self._in_state("PENDING", name)]
+        return {status.executor_id for status in statuses if status.executor_id is not None}
 
-    def requeue_messages(self, executor: str) -> None:
-        """Put the messages back in the queue that a worker was delivering when it died."""
-        stranded = [message for message, worker in self.delivering().items() if worker == executor]
-        if stranded:
-            with self._connection_errors():
-                self._client.resume_workflows(stranded, queue_name=MESSAGES)
+    def requeue_work_of(self, executor: str) -> list[str]:
+        """Put back in the queue what a worker has taken that died or ends: ids of jobs, messages and tasks."""
+        found: list[str] = []
+        for name in _QUEUES:
+            taken = [status.workflow_id for status in self._in_state("PENDING", name) if status.executor_id == executor]
+            if taken:
+                with self._connection_errors():
+                    # Without a name they would go to DBOS's internal queue, which has no limit on concurrency.
+                    self._client.resume_workflows(list(taken), queue_name=name)
+            found += taken
+        return found
 
     def _in_state(self, status: str, name: str = WORKFLOW) -> list[WorkflowStatus]:
         with self._connection_errors():
@@ -154,7 +168,6 @@ class Engine:
             return
         try:
             with self._connection_errors():
-                # Without a name they would go to DBOS's internal queue, which has no limit on concurrency.
                 self._client.resume_workflows(list(job_ids), queue_name=QUEUE)
         except dbos_error.DBOSNonExistentWorkflowError as error:
             raise _no_entry(job_ids) from error
@@ -175,11 +188,19 @@ class Engine:
                 "that is still needed."
             ) from error
 
-    def delete(self, job_id: str) -> None:
-        """Remove the entry of a job, and its messages."""
+    def running_tasks(self, job_id: str) -> list[str]:
+        """Entries of the tasks of a job that a worker has taken."""
         with self._connection_errors():
-            messages = self._client.list_workflows(workflow_id_prefix=f"{job_id}.", load_input=False, load_output=False)
-            self._client.delete_workflows([job_id, *(message.workflow_id for message in messages)])
+            taken = self._client.list_workflows(
+                status="PENDING", name=TASKS, workflow_id_prefix=f"{job_id}.", load_input=False, load_output=False
+            )
+        return [status.workflow_id for status in taken]
+
+    def delete(self, job_id: str) -> None:
+        """Remove the entry of a job, its messages and its tasks."""
+        with self._connection_errors():
+            others = self._client.list_workflows(workflow_id_prefix=f"{job_id}.", load_input=False, load_output=False)
+            self._client.delete_workflows([job_id, *(other.workflow_id for other in others)])
 
     def close(self) -> None:
         self._client.destroy()
@@ -192,13 +213,14 @@ def executing(
     slots: int,
     run: Callable[[str], Awaitable[Outcome]],
     deliver: Callable[[str, str, dict[str, Any], int], None],
+    run_task: Callable[[str, str], Awaitable[Outcome]],
 ) -> Iterator[None]:
     """Take jobs from the queue while the context lasts, `slots` at a time, and await `run(job_id)` for each.
 
-
-    `deliver` sends one message (id, job, content, attempt).
-    `run` is cancelled within two seconds after its job is cancelled or the context ends; it then has ten seconds. Enter
-    it only once per process. `slots` is a property of the queue: the last worker to start sets it for all workers.
+    `deliver` sends one message (id, job, content, attempt), `run_task` does one task (job, task), one at a time. `run`
+    and `run_task` are cancelled within two seconds after their work is cancelled or the context ends; they then have
+    ten seconds. Enter it only once per process. `slots` is a property of the queue: the last worker to start sets it
+    for all workers.
     """
     _prepare(url)
     # DBOS logs a normal cancellation as an error with a traceback. Real errors are in the job's own record and log.
@@ -226,11 +248,21 @@ def executing(
     def messages(message_id: str, job_id: str, content: dict[str, Any], attempt: int) -> None:
         DBOS.run_step({"name": "deliver"}, deliver, message_id, job_id, content, attempt)
 
-    DBOS.listen_queues([QUEUE, MESSAGES])
+    @DBOS.step(name="task", preemptible=True)
+    async def task_step(job_id: str, number: str) -> dict[str, Any]:
+        outcome = await run_task(job_id, number)
+        return {"state": outcome.state.value, "error": outcome.error}
+
+    @DBOS.workflow(name=TASKS)
+    async def task(job_id: str, number: str) -> dict[str, Any]:
+        return await task_step(job_id, number)
+
+    DBOS.listen_queues([QUEUE, MESSAGES, TASKS])
     DBOS.launch()
     try:
         DBOS.register_queue(QUEUE, worker_concurrency=slots, polling_interval_sec=POLL_S, on_conflict="always_update")
         DBOS.register_queue(MESSAGES, worker_concurrency=4, polling_interval_sec=POLL_S)
+        DBOS.register_queue(TASKS, worker_concurrency=1, polling_interval_sec=POLL_S)
         yield
     finally:
         DBOS.destroy(destroy_registry=True)

@@ -164,6 +164,9 @@ class JobQueue:
         job = self.get(job_id)
         if job.state is JobState.RUNNING:
             raise JobConflict(f"Job {job_id} is running. Cancel it first.")
+        if running := self._engine.running_tasks(job_id):
+            number = running[0].rpartition(".")[2]
+            raise JobConflict(f"Task {number} of job {job_id} is running. Delete that first.")
         if job.state is JobState.QUEUED:
             self._engine.cancel(job_id)
         self.store.delete(job_id)

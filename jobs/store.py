@@ -1,7 +1,7 @@
 """Store: captures and jobs on disk.
 
     <root>/captures/<sha256>/    an unpacked capture, shared by all jobs that use it
-    <root>/jobs/<id>/            job.json, attempts.json, progress.jsonl, log.txt, lock, run/ (the folder of the run)
+    <root>/jobs/<id>/            job.json, attempts.json, progress.jsonl, log.txt, lock, tasks/<id>/, run/ (the run)
     <root>/submissions/          the job of each idempotency key, as a link
     <root>/uploads/              archives that are being uploaded or unpacked
     <root>/workers/              leases of workers on this machine
@@ -88,6 +88,11 @@ class JobFolder:
     @property
     def model(self) -> Path:
         return self.run / MODEL_FILE
+
+    @property
+    def tasks(self) -> Path:
+        """A folder for each evaluation and video that was asked for (`jobs.task`)."""
+        return self.path / "tasks"
 
     def spec(self) -> JobSpec:
         """The specification. Raises `JobDamaged`, and `JobNotFound` if the job was deleted meanwhile."""

@@ -17,13 +17,13 @@ import time
 from collections.abc import Iterable
 from typing import Any, NoReturn
 
+from jobs.child_process import GRACE_S, ChildProcess, ProcessExit
 from jobs.engine import Engine, executing
 from jobs.exit_code import OUT_OF_MEMORY, ExitCode
 from jobs.job import Attempt, JobError, JobNotFound, JobState, Outcome
 from jobs.lease import Leases, open_leases
 from jobs.queue import JobQueue
-from jobs.store import Store
-from jobs.trainer_child import GRACE_S, ProcessExit, TrainerChild
+from jobs.store import JobFolder, Store
 from jobs.webhooks import RETRY_AFTER_S, WebhookError, deliver
 
 LOG = logging.getLogger(__name__)
@@ -44,7 +44,8 @@ class Worker:
         self._slots = slots
         self._threads = threads
         self._nice = nice
-        self._trainers: dict[str, TrainerChild] = {}
+        self._trainers: dict[str, ChildProcess] = {}
+        self._told: dict[str, int | None] = {}  # the checkpoint of each trainer that its webhook knows
         self._stopping = False
 
     def run(self, stop: threading.Event) -> None:
@@ -58,7 +59,7 @@ class Worker:
         if not leases.acquire(self.id):
             raise JobError(f"The lease of worker {self.id} is held by another process. Start the worker again.")
         try:
-            with executing(self._url, self.id, self._slots, self._work, self._deliver):
+            with executing(self._url, self.id, self._slots, self._work, self._deliver, self._do_task):
                 LOG.info("worker %s takes jobs: %d at a time, %d threads each", self.id, self._slots, self._threads)
                 self._supervise(engine, leases, stop)
                 self._stop_all()
@@ -71,9 +72,9 @@ class Worker:
             _end_process()
 
     def _return_jobs(self, engine: Engine) -> bool:
-        """Put our unfinished jobs back in the queue; False if the database does not answer."""
+        """Put our unfinished work back in the queue; False if the database does not answer."""
         try:
-            engine.requeue([entry.job_id for entry in engine.running() if entry.executor == self.id])
+            engine.requeue_work_of(self.id)
         except JobError as error:
             # The lease ends with this process, so that other workers requeue these jobs as those of a dead worker.
             LOG.warning("worker %s could not return its jobs, other workers will: %s", self.id, error)
@@ -89,8 +90,8 @@ class Worker:
                 # Before the query: the job of a trainer that starts in between is not in its result yet.
                 trainers = list(self._trainers.items())
                 running = {entry.job_id: entry.executor for entry in engine.running()}
-                self._tell_checkpoints(trainers)
-                requeue_jobs_of_dead_workers(engine, leases, self.id, running)
+                self._tell_checkpoints([job_id for job_id, _ in trainers])
+                requeue_work_of_dead_workers(engine, leases, self.id)
                 for job_id, trainer in trainers:
                     if running.get(job_id) != self.id and not trainer.stopping:
                         LOG.warning("job %s was cancelled or given to another worker: stopping its trainer", job_id)
@@ -111,11 +112,11 @@ class Worker:
         except JobError as error:
             LOG.warning("job %s: its webhook is not told of %s: %s", job_id, event, error)
 
-    def _tell_checkpoints(self, trainers: Iterable[tuple[str, TrainerChild]]) -> None:
-        for job_id, trainer in trainers:
+    def _tell_checkpoints(self, job_ids: Iterable[str]) -> None:
+        for job_id in job_ids:
             newest = self._store.folder(job_id).checkpoint()
-            if newest is not None and newest != trainer.told_checkpoint:
-                trainer.told_checkpoint = newest
+            if newest is not None and newest != self._told.get(job_id):
+                self._told[job_id] = newest
                 self._tell(job_id, "checkpoint", newest)
 
     def _deliver(self, message_id: str, job_id: str, content: dict[str, Any], attempt: int) -> None:
@@ -151,7 +152,8 @@ class Worker:
             attempt = folder.begin_attempt(self.id)
             await asyncio.to_thread(self._tell, job_id, "started", attempt.number)
             LOG.info("job %s: attempt %d from iteration %d", job_id, attempt.number, attempt.checkpoint)
-            trainer = TrainerChild(folder, self._threads, nice=self._nice)
+            trainer = self._child("jobs.trainer_process", folder)
+            self._told[job_id] = folder.checkpoint()
             try:
                 ending = await self._run_trainer(job_id, trainer)
             except asyncio.CancelledError:
@@ -169,12 +171,25 @@ class Worker:
         await asyncio.Event().wait()
         raise AssertionError("unreachable: only cancellation ends the wait")
 
+    async def _do_task(self, job_id: str, number: str) -> Outcome:
+        """Evaluate a job or make its video."""
+        ending = await self._child("jobs.task_process", self._store.folder(job_id), number).run()
+        LOG.info("job %s: task %s ended with code %d", job_id, number, ending.code)
+        if ending.code == ExitCode.DONE:
+            return Outcome(JobState.SUCCEEDED)
+        killed = f"It ended with code {ending.code}, most likely because memory ran out. Ask for a smaller one."
+        return Outcome(JobState.FAILED, ending.message or killed)
+
+    def _child(self, module: str, folder: JobFolder, *arguments: str) -> ChildProcess:
+        command = [module, str(folder.path), *arguments, "--threads", str(self._threads)]
+        return ChildProcess(command, folder.log, nice=self._nice)
+
     async def _ended(self, job_id: str, number: int, outcome: Outcome) -> Outcome:
         changes = {"state": outcome.state, "error": outcome.error, "finished_at": time.time()}
         await asyncio.to_thread(self._tell, job_id, "ended", number, **changes)
         return outcome
 
-    async def _run_trainer(self, job_id: str, trainer: TrainerChild) -> ProcessExit:
+    async def _run_trainer(self, job_id: str, trainer: ChildProcess) -> ProcessExit:
         """Run a trainer, registered so that `_supervise` can stop it."""
         earlier = self._trainers.get(job_id)
         if earlier is not None:
@@ -188,20 +203,16 @@ class Worker:
                 del self._trainers[job_id]
 
 
-def requeue_jobs_of_dead_workers(engine: Engine, leases: Leases, own: str, running: dict[str, str | None]) -> None:
-    """Put the jobs of dead workers back in the queue. Any number of workers may call this at once.
+def requeue_work_of_dead_workers(engine: Engine, leases: Leases, own: str) -> None:
+    """Put jobs, messages and tasks of dead workers back in the queue. Any number of workers may call this at once.
 
-    `own` is the id of this worker, `running` the worker of each running job.
+    `own` is the id of this worker.
     """
-    workers = {*running.values(), *engine.delivering().values()}
-    for executor in sorted({worker for worker in workers if worker is not None and worker != own}):
+    for executor in sorted(engine.at_work() - {own}):
         if not leases.acquire_from_dead(executor):
             continue  # alive, or another worker requeues its jobs
         try:
-            job_ids = [entry.job_id for entry in engine.running() if entry.executor == executor]
-            LOG.warning("worker %s died: back in the queue: %s", executor, ", ".join(job_ids) or "nothing")
-            engine.requeue(job_ids)
-            engine.requeue_messages(executor)
+            LOG.warning("worker %s died: back in the queue: %s", executor, ", ".join(engine.requeue_work_of(executor)))
         finally:
             leases.release(executor)
 

@@ -21,7 +21,7 @@ from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
 from service.head import Head
-from service.routes import captures, export, jobs, plans, render, results, scenes, sessions, system
+from service.routes import captures, export, jobs, plans, render, results, scenes, sessions, system, tasks
 from service.same_origin import SameOrigin
 from service.security_headers import SecurityHeaders
 from service.settings import Settings
@@ -79,7 +79,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Head)
     app.add_middleware(SecurityHeaders)
     app.add_middleware(Telemetry, registry=registry)
-    for routes in (captures, jobs, plans, results, export, render, scenes, sessions, system):
+    for routes in (captures, jobs, plans, results, export, render, scenes, tasks, sessions, system):
         app.include_router(routes.router, dependencies=[Depends(authorize)])
     for routes in (sessions, system):
         app.include_router(routes.open_router)

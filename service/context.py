@@ -13,6 +13,7 @@ from jobs.lease import Leases, open_leases
 from jobs.leftovers import discard_leftovers
 from jobs.queue import JobQueue
 from jobs.store import Store
+from jobs.task_list import TaskList
 from service.archives import Limits
 from service.keys import Keys
 from service.rendering import ModelCache, RenderPool
@@ -31,6 +32,7 @@ class Context:
     store: Store
     engine: Engine
     jobs: JobQueue
+    tasks: TaskList
     leases: Leases
     models: ModelCache
     pool: RenderPool
@@ -70,6 +72,7 @@ def open_context(settings: Settings) -> Context:
         store=store,
         engine=engine,
         jobs=jobs,
+        tasks=TaskList(store, engine),
         leases=open_leases(settings.database_url, store.workers),
         models=ModelCache(settings.models_mb * MB),
         pool=RenderPool(settings.images_at_once, settings.images_mb * MB),

@@ -23,6 +23,7 @@ from starlette.routing import Match, Mount
 
 from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError
 from jobs.job import CaptureNotFound, JobConflict, JobDamaged, JobError, JobNotFound, OtherSubmission
+from jobs.task import TaskNotFound
 
 LOG = logging.getLogger(__name__)
 
@@ -116,6 +117,7 @@ class NotAcceptable(ServiceError):
 # The first matching class counts.
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (JobNotFound, 404, "no-such-job"),
+    (TaskNotFound, 404, "no-such-task"),
     (CaptureNotFound, 404, "no-such-capture"),
     (JobConflict, 409, "state-conflict"),
     (JobDamaged, 500, "job-damaged"),

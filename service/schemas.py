@@ -95,7 +95,9 @@ def job_summary(job: Job) -> JobSummary:
         links |= {"render": f"/render?job={job.id}", "export": f"{base}/export?format=ply"}
         links["views"] = f"{base}/views"
         links["scene"] = f"{base}/scene" + ("" if job.checkpoint is None else f"?checkpoint={job.checkpoint}")
-        links["comparison"] = f"{base}/comparison"
+        links |= {"comparison": f"{base}/comparison", "videos": f"{base}/videos", "tasks": f"{base}/tasks"}
+        if job.state.final:
+            links["evaluate"] = f"{base}/evaluate"
     if job.has_plan:
         links["plan"] = f"{base}/plan"
     if job.has_metrics:

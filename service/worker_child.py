@@ -12,7 +12,7 @@ import sys
 import threading
 from types import TracebackType
 
-from jobs.trainer_child import GRACE_S
+from jobs.child_process import GRACE_S
 from service.settings import Settings
 
 LOG = logging.getLogger(__name__)

@@ -78,6 +78,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "graings.storage.run_folder",
     ),
     "jobs.footage_phase": ("graings.footage", "jobs"),
+    "jobs.task": ("graings.camera.view_request", "graings.export.camera_path", "graings.storage.files", "jobs"),
+    "jobs.task_process": ("graings.export", "graings.kernel", "graings.report.evaluate_run", "jobs"),
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.storage", "graings.training", "jobs"),
     # What a program elsewhere uses: it knows nothing but HTTP.
     "client": (),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -38,13 +38,15 @@ class PathKey:
     time: float | None
 
 
-def frames_of(shown: Shown, request: ViewRequest, path: str, moves: Moves, count: int) -> list[tuple[Camera, float]]:
+def frames_of(
+    shown: Shown, request: ViewRequest, path: str | Mapping[str, Any], moves: Moves, count: int
+) -> list[tuple[Camera, float]]:
     """Camera and time in [0, 1] of `count` frames.
 
-    `path` is `orbit`, once around from the view of `request`, `views`, a closed spline through training views, or the
-    name of a file. What does not move stays as in `request`: the camera if `moves` is `time`, the time if it is
-    `camera`. The frames of a nerfstudio file are used as they are, whatever `count` is. Raises `ValueError` for
-    parameters out of range, `CheckpointError` for a file that cannot be used.
+    `path` is `orbit`, once around from the view of `request`, `views`, a closed spline through training views, the name
+    of a file, or what such a file holds. What does not move stays as in `request`: the camera if `moves` is `time`, the
+    time if it is `camera`. The frames of a nerfstudio file are used as they are, whatever `count` is. Raises
+    `ValueError` for parameters out of range, `CheckpointError` for a file that cannot be used.
     """
     if count < 1:
         raise ValueError(f"a video needs at least one frame, got {count}")
@@ -62,8 +64,10 @@ def frames_of(shown: Shown, request: ViewRequest, path: str, moves: Moves, count
     elif path == VIEWS:
         chosen = [PathKey(sized(view.camera, request.width, request.height), None) for view in around(shown)]
         cameras = spline(chosen, count, closed=True)
-    else:
+    elif isinstance(path, str):
         cameras = _from_file(Path(path), shown, request, count)
+    else:
+        cameras = _from_document(path, "path", shown, request, count)
     last = max(1, len(cameras) - 1)
     frames = []
     for index, key in enumerate(cameras):
@@ -129,6 +133,13 @@ def _catmull_rom(rows: NDArray[np.float64], place: float, closed: bool) -> NDArr
 def _from_file(path: Path, shown: Shown, request: ViewRequest, count: int) -> list[PathKey]:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: no camera path ({error}). {_REMEDY}") from error
+    return _from_document(document, str(path), shown, request, count)
+
+
+def _from_document(document: Any, name: str, shown: Shown, request: ViewRequest, count: int) -> list[PathKey]:
+    try:
         if not isinstance(document, dict):
             raise ValueError("must be a JSON object")
         if "camera_path" in document:
@@ -139,8 +150,8 @@ def _from_file(path: Path, shown: Shown, request: ViewRequest, count: int) -> li
         if any((key.time is None) != (keys[0].time is None) for key in keys):
             raise ValueError("give t for every key or for none")
         return spline(keys, count, closed=bool(document.get("closed", False)))
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise CheckpointError(f"{path}: no camera path ({error}). {_REMEDY}") from error
+    except (ValueError, TypeError, KeyError) as error:
+        raise CheckpointError(f"{name}: no camera path ({error}). {_REMEDY}") from error
 
 
 def _key(entry: dict[str, Any], shown: Shown, request: ViewRequest) -> PathKey:

@@ -2,6 +2,7 @@
 
 import { count, element, span } from "./format.js";
 import { may, request } from "./requests.js";
+import { ask, showTasks } from "./tasks.js";
 
 const $ = (id) => document.getElementById(id);
 const FILES = { model: "model", metrics: "metrics.json", report: "report", log: "log" };
@@ -12,6 +13,7 @@ const FILES = { model: "model", metrics: "metrics.json", report: "report", log: 
  */
 export function showFacts(job, then) {
   $("facts").hidden = !job;
+  showTasks(job);
   if (!job) return;
   const report = job.progress || {};
   const running = job.state === "running";
@@ -64,6 +66,8 @@ function showActions(job, then) {
   };
   const verbs = ["cancel", "resume", "retry"].filter((verb) => job.links[verb]);
   const buttons = verbs.map((verb) => button(verb, () => request(job.links[verb], { method: "POST" })));
+  if (job.links.evaluate) buttons.push(button("test views", () => ask(job.links.evaluate)));
+  if (job.links.videos) buttons.push(button("video", () => ask(job.links.videos, { moves: "both" })));
   if (may("train")) buttons.push(button("share", () => share(job)));
   if (job.state !== "running") {
     buttons.push(button("delete", async () => {

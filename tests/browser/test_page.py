@@ -111,6 +111,16 @@ def test_a_held_out_photograph_beside_the_model(service: str, job: str, open_pag
     assert canvas.evaluate("canvas => [canvas.width, canvas.height]") == [width // 3, height]
 
 
+def test_test_views_are_measured_and_a_video_is_made(service: str, job: str, open_page: OpenPage) -> None:
+    page = open_page(f"{service}/#job={job}")
+    page.get_by_role("button", name="Test views").click()
+    page.get_by_role("button", name="Video", exact=True).click()
+    page.locator("#tasks li", has_text="Video (mp4)").get_by_role("link", name="download").wait_for()
+    page.locator("#tasks li", has_text=re.compile(r"Evaluation of test: \d+\.\d\d dB")).wait_for()
+    address = page.locator("#tasks a").get_attribute("href")
+    assert httpx2.get(f"{service}{address}").content[4:8] == b"ftyp"
+
+
 def test_without_webgl_the_server_draws(service: str, job: str, browser: Any) -> None:
     context = browser.new_context()
     context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")

@@ -37,6 +37,10 @@ def deliver(*_: object) -> None:
     raise AssertionError("no message was sent")
 
 
+async def do_task(*_: object) -> Outcome:
+    raise AssertionError("no task was enqueued")
+
+
 def state(engine: Engine, job_id: str) -> JobState:
     return engine.entries([job_id])[job_id].state
 
@@ -58,7 +62,7 @@ def test_jobs_run_by_priority_and_end_with_their_outcome(engine: Engine) -> None
     for job_id, priority in (("diverged", 30), ("failed", 20), ("broken", 15), ("succeeded", 10)):
         engine.enqueue(job_id, priority)
     assert engine.waiting() == 4
-    with executing(engine.url, "worker-a", 1, run, deliver):
+    with executing(engine.url, "worker-a", 1, run, deliver, do_task):
         until(lambda: engine.waiting() == 0 and not engine.running())
     assert order == ["succeeded", "broken", "failed", "diverged"]
     entries = engine.entries(order)
@@ -91,7 +95,7 @@ def test_a_job_can_be_cancelled_requeued_and_rewound_but_runs_under_its_own_limi
         return Outcome(JobState.FAILED, "on purpose")
 
     engine.enqueue("a", 10)
-    with executing(engine.url, "worker-a", 1, run, deliver):
+    with executing(engine.url, "worker-a", 1, run, deliver, do_task):
         until(lambda: running == ["a"])
         engine.enqueue("b", 10)
         engine.cancel("a")
@@ -121,11 +125,11 @@ def test_the_end_of_a_worker_stops_its_job_and_another_worker_can_take_it(engine
         return Outcome(JobState.SUCCEEDED)
 
     engine.enqueue("a", 10)
-    with executing(engine.url, "worker-a", 1, endless, deliver):
+    with executing(engine.url, "worker-a", 1, endless, deliver, do_task):
         assert began.wait(10)
     assert [(entry.job_id, entry.executor) for entry in engine.running()] == [("a", "worker-a")]
     engine.requeue(["a"])
-    with executing(engine.url, "worker-b", 1, brief, deliver):
+    with executing(engine.url, "worker-b", 1, brief, deliver, do_task):
         until(lambda: state(engine, "a") is JobState.SUCCEEDED)
 
 
@@ -147,7 +151,7 @@ def test_concurrent_retries_of_a_job_all_succeed(tmp_path: Path, engine: Engine)
     jobs = JobQueue(Store(tmp_path / "data"), engine)
     (tmp_path / "capture").mkdir()
     job_id = jobs.submit(JobSpec("a", "0" * 64, {}), tmp_path / "capture").id
-    with executing(engine.url, "worker-a", 1, run, deliver):
+    with executing(engine.url, "worker-a", 1, run, deliver, do_task):
         until(lambda: jobs.get(job_id).state is JobState.FAILED)
     together = threading.Barrier(8)
 

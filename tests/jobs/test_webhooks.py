@@ -24,7 +24,7 @@ from jobs.lease import FileLeases
 from jobs.queue import JobQueue
 from jobs.store import Store
 from jobs.webhooks import PRIVATE, WebhookError, deliver
-from jobs.worker import Worker, requeue_jobs_of_dead_workers
+from jobs.worker import Worker, requeue_work_of_dead_workers
 
 LONG_S = 120.0
 SECRET = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"
@@ -179,8 +179,8 @@ def test_a_message_of_a_dead_worker_is_delivered_by_another(jobs: JobQueue) -> N
             "update workflow_status set status = 'PENDING', executor_id = 'dead' where workflow_uuid = ?",
             (message.workflow_id,),
         )
-    assert engine.delivering() == {message.workflow_id: "dead"}
-    requeue_jobs_of_dead_workers(engine, FileLeases(jobs.store.workers), "own", {})
-    assert engine.delivering() == {}
+    assert engine.at_work() == {"dead"}
+    requeue_work_of_dead_workers(engine, FileLeases(jobs.store.workers), "own")
+    assert engine.at_work() == set()
     assert [status.workflow_id for status in engine._in_state("ENQUEUED", MESSAGES)] == [message.workflow_id]
     engine.close()

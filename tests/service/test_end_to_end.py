@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from client import Client
+from client import Client, ClientError
 from tests.service.test_commands import LONG_S, readiness
 
 BRIEF = {"iterations": 12, "init.points": 200, "evaluation.views": 1}
@@ -38,6 +38,11 @@ def test_a_job_is_uploaded_trained_and_rendered_over_http(tmp_path: Path, captur
                 metrics = client.download(job.id, "metrics", tmp_path / "metrics.json")
                 assert json.loads(metrics.read_text())["iterations"] == 12
                 assert client.render(job.id, camera="val:0", format="png")[:4] == b"\x89PNG"
+                assert client.evaluate(job.id, "test")["splits"]["test"]["psnr"] > 5
+                video = client.video(job.id, tmp_path / "video.gif", width=16, seconds=0.2, fps=20)
+                assert video.read_bytes()[:6] == b"GIF89a"
+                with pytest.raises(ClientError, match="frames"):
+                    client.video(job.id, video, seconds=600, fps=200)
                 job = client.wait(client.extend(job.id, 6).id)
                 assert (job.state, job.error, job.checkpoint) == ("succeeded", None, 18)
             process.send_signal(signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""TrainerChild: start one trainer process, wait for it, and stop it.
+"""ChildProcess: start one process of a job, wait for it, and stop it.
 
 Runs on an event loop; `stop` may be called from any thread.
 """
@@ -10,11 +10,10 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-
-from jobs.store import JobFolder
 
 GRACE_S = 45.0  # seconds; loading a large capture or evaluating all held-out views cannot be interrupted
 
@@ -27,18 +26,20 @@ class ProcessExit:
     message: str | None
 
 
-class TrainerChild:
-    """A child process that trains in one job folder, with its priority on the CPU lowered by `nice` (0 to 19)."""
+class ChildProcess:
+    """`python -m` with `arguments`, whose standard error is appended to the file `log`.
 
-    def __init__(self, folder: JobFolder, threads: int, *, nice: int = 0, grace_s: float = GRACE_S) -> None:
-        self._folder = folder
-        self._threads = threads
+    Its priority on the CPU is lowered by `nice` (0 to 19).
+    """
+
+    def __init__(self, arguments: Sequence[str], log: Path, *, nice: int = 0, grace_s: float = GRACE_S) -> None:
+        self._arguments = arguments
+        self._log = log
         self._nice = nice
         self._grace_s = grace_s
         self._loop = asyncio.get_running_loop()
         self._process: asyncio.subprocess.Process | None = None
         self._stopping = False
-        self.told_checkpoint = folder.checkpoint()  # the newest that the webhook knows
 
     @property
     def stopping(self) -> bool:
@@ -46,10 +47,10 @@ class TrainerChild:
         return self._stopping
 
     async def run(self) -> ProcessExit:
-        """Start the child and wait until it ends. If cancelled, stop the child at a checkpoint first."""
-        with self._folder.log.open("ab") as log:
+        """Start the child and wait until it ends. If cancelled, stop the child first."""
+        with self._log.open("ab") as log:
             self._process = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "jobs.trainer_process", str(self._folder.path), "--threads", str(self._threads),
+                sys.executable, "-m", *self._arguments,
                 stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=log,
                 # A Ctrl-C in the terminal goes to the worker only, which then stops the child.
                 start_new_session=True,
@@ -66,7 +67,7 @@ class TrainerChild:
             raise
 
     def stop(self) -> None:
-        """Make the child write a checkpoint and end; it is killed if it has not ended after the grace time."""
+        """Ask the child to end; it is killed if it has not ended after the grace time."""
         self._loop.call_soon_threadsafe(self._stop)
 
     def _stop(self) -> None:
