@@ -145,7 +145,7 @@ class AsyncClient:
     async def _finished(self, task: dict[str, Any]) -> dict[str, Any]:
         while not calls.finished(task):
             await asyncio.sleep(calls.POLL_S)
-            task = await self._do(calls.task(task))
+            task = await self._do(calls.poll(task))
         return task
 
     async def delete(self, job_id: str) -> None:

@@ -145,7 +145,7 @@ class Client:
     def _finished(self, task: dict[str, Any]) -> dict[str, Any]:
         while not calls.finished(task):
             time.sleep(calls.POLL_S)
-            task = self._do(calls.task(task))
+            task = self._do(calls.poll(task))
         return task
 
     def delete(self, job_id: str) -> None:

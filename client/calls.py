@@ -101,7 +101,7 @@ def linked(task: dict[str, Any], name: str) -> Call[bytes]:
     return Call("GET", task["links"][name], _content)
 
 
-def task(task: dict[str, Any]) -> Call[dict[str, Any]]:
+def poll(task: dict[str, Any]) -> Call[dict[str, Any]]:
     """The same task now."""
     return Call("GET", task["links"]["self"], _json)
 

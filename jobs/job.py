@@ -19,6 +19,7 @@ The last checkpoint is always kept, and a job that is queued again continues fro
 from __future__ import annotations
 
 import re
+import uuid
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
@@ -149,6 +150,11 @@ class Job:
 def is_id(name: str) -> bool:
     """Whether `name` has the form of a job id."""
     return _ID.fullmatch(name) is not None
+
+
+def new_id(now: float) -> str:
+    """An id that begins with the time `now` (Unix seconds), so that ids sort by age."""
+    return f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
 
 
 def check_id(job_id: str) -> str:

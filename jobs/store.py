@@ -16,7 +16,6 @@ import json
 import os
 import shutil
 import time
-import uuid
 from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,6 +35,7 @@ from jobs.job import (
     OtherSubmission,
     check_id,
     is_id,
+    new_id,
 )
 from jobs.locks import locked
 
@@ -180,7 +180,7 @@ class Store:
         job was submitted differently, and `CaptureNotFound` where the capture is not there any more.
         """
         now = time.time()
-        job_id = f"{int(now * 1000):011x}{uuid.uuid4().hex[:5]}"
+        job_id = new_id(now)
         if unpacked is not None:
             sync_tree(unpacked)  # after a power failure no job may be there without its images
         submission = self._submissions / hashlib.sha256(f"{spec.owner} {key}".encode()).hexdigest()

@@ -8,7 +8,6 @@ A task waits in the queue beside the jobs, and survives the death of its worker:
 from __future__ import annotations
 
 import time
-import uuid
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -19,7 +18,7 @@ from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.document import Document, read_document
 from graings.export.camera_path import Moves
 from graings.storage.files import write_document
-from jobs.job import JobError, JobState
+from jobs.job import JobError, JobState, new_id
 
 MAX_FRAMES: Final = 3_600
 HeldOut = Literal["val", "test", "between"]
@@ -108,7 +107,7 @@ class TaskFolder:
     def create(cls, tasks: Path, spec: TaskSpec) -> TaskFolder:
         """A new task in the folder of all tasks of a job."""
         made = time.time()
-        folder = cls(tasks / f"{int(made * 1000):011x}{uuid.uuid4().hex[:5]}")
+        folder = cls(tasks / new_id(made))
         folder.path.mkdir(parents=True)
         write_document(folder.path / _TASK, TaskRecord(created_at=made, spec=spec))
         return folder

@@ -66,18 +66,21 @@ class TaskList:
         entry = self._engine.entries([_entry_id(job_id, number)]).get(_entry_id(job_id, number))
         if entry is not None and not entry.state.final:
             self._engine.cancel(entry.job_id)
-        shutil.rmtree(self.folder(job_id, number).path)
+        # Its process may still write for two seconds: renamed first, the folder gets no new files while it is removed.
+        deleted = self._store.uploads / f"{number}.deleted"
+        with suppress(FileNotFoundError):  # two requests at once
+            self.folder(job_id, number).path.rename(deleted)
+            shutil.rmtree(deleted)
 
     def _ids(self, job_id: str) -> list[str]:
         tasks = self._store.folder(job_id).tasks
-        return (
-            sorted((path.name for path in tasks.iterdir() if is_id(path.name)), reverse=True) if tasks.exists() else []
-        )
+        numbers = (path.name for path in tasks.iterdir()) if tasks.exists() else ()
+        return sorted(filter(is_id, numbers), reverse=True)
 
     def _task(self, job_id: str, number: str, entry: QueueEntry | None) -> Task:
         folder = self.folder(job_id, number)
         try:
-            record = folder.record
+            record, progress = folder.record, folder.progress
         except CheckpointError as error:
             raise TaskNotFound(job_id, number) from error  # damaged, or deleted meanwhile
         if entry is None:  # the process that submitted it died before it was queued
@@ -89,7 +92,7 @@ class TaskList:
             state=entry.state,
             created_at=record.created_at,
             finished_at=entry.finished_at,
-            progress=folder.progress,
+            progress=progress,
             error=entry.error,
         )
 

@@ -43,12 +43,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("task", help="the task")
     parser.add_argument("--threads", type=int, required=True, help="greatest number of CPU threads")
     arguments = parser.parse_args(argv)
+    folder = JobFolder(arguments.folder.resolve())
     try:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, _stop)
         watch_parent(lambda: os.kill(os.getpid(), signal.SIGTERM))
         use_threads(arguments.threads)
-        folder = JobFolder(arguments.folder.resolve())
         task = TaskFolder(folder.tasks / arguments.task)
         spec = task.record.spec
         if isinstance(spec, VideoSpec):
@@ -58,11 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Ended:
         return ExitCode.STOPPED
     except (GraingsError, ValueError) as error:
-        return _end(ExitCode.REFUSED, str(error))
+        return _end(ExitCode.REFUSED, str(error), folder)
     except Exception as error:
         # The outermost frame of the process: the traceback goes to the log, the message to the client.
         traceback.print_exc()
-        return _end(ExitCode.CRASHED, f"{type(error).__name__}: {error}. The log has the traceback.")
+        return _end(ExitCode.CRASHED, f"{type(error).__name__}: {error}. The log has the traceback.", folder)
     return ExitCode.DONE
 
 
@@ -91,8 +91,9 @@ def _stop(*_: Any) -> None:
     raise Ended
 
 
-def _end(code: ExitCode, message: str) -> int:
+def _end(code: ExitCode, message: str, folder: JobFolder) -> int:
     print(message, file=sys.stderr, flush=True)
+    message = message.replace(f"{folder.path.parent.parent}/", "")  # clients know nothing of the folders here
     print(json.dumps({"error": message}), flush=True)
     return code
 

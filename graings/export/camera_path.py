@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graings.camera.camera import Camera, View
-from graings.camera.view_request import ViewRequest
+from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.camera.viewpoint import sized
 from graings.errors import CheckpointError
 from graings.export.shown import Shown
@@ -150,7 +150,7 @@ def _from_document(document: Any, name: str, shown: Shown, request: ViewRequest,
         if any((key.time is None) != (keys[0].time is None) for key in keys):
             raise ValueError("give t for every key or for none")
         return spline(keys, count, closed=bool(document.get("closed", False)))
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, ArithmeticError) as error:
         raise CheckpointError(f"{name}: no camera path ({error}). {_REMEDY}") from error
 
 
@@ -167,11 +167,16 @@ def _key(entry: dict[str, Any], shown: Shown, request: ViewRequest) -> PathKey:
 def _nerfstudio(document: dict[str, Any], shown: Shown, request: ViewRequest) -> list[PathKey]:
     """Every frame of a camera_path.json: camera_to_world (4x4, OpenGL axes) and the vertical field of view."""
     width, height = int(document["render_width"]), int(document["render_height"])
+    if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
+        raise ValueError(f"render_width and render_height must lie from 1 to {MAX_SIDE}, got {width} x {height}")
     keys = []
     for entry in document["camera_path"]:
         pose = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
         pose[:3, 1:3] *= -1  # OpenGL: y up, z backward
-        focal = 0.5 * height / math.tan(math.radians(float(entry["fov"])) / 2)
+        fov = float(entry["fov"])
+        if not 0 < fov < 180:
+            raise ValueError(f"fov must lie between 0 and 180 degrees, got {fov}")
+        focal = 0.5 * height / math.tan(math.radians(fov) / 2)
         matrix = shown.units.camera(np.linalg.inv(pose))
         camera = Camera(matrix, focal, focal, width / 2, height / 2, width, height)
         time = entry.get("render_time")

@@ -20,6 +20,13 @@ TINY = {"width": 16, "seconds": 0.25, "fps": 20}
 LONG = {"width": 1200, "seconds": 60, "fps": 60, "moves": "camera"}  # minutes of rendering
 
 
+POSE = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1]
+
+
+def nerfstudio(**changes: Any) -> dict[str, Any]:
+    return {"render_width": 16, "render_height": 16, "camera_path": [{"camera_to_world": POSE, "fov": 50}], **changes}
+
+
 @pytest.fixture
 def jobs(client: TestClient) -> JobQueue:
     queue: JobQueue = client.app.state.context.jobs  # type: ignore[attr-defined]
@@ -108,6 +115,11 @@ def test_a_video_survives_its_worker_and_a_deleted_one_stops(client: TestClient,
         ({"path": {"keys": []}}, "keys"),
         ({"path": {"keys": [{"azimuth": 0, "zoom": 2}]}}, "zoom"),
         ({"path": {"camera_path": 3}}, "path"),
+        ({"path": nerfstudio(render_width=10**9)}, "render_width"),
+        ({"path": nerfstudio(render_height=0)}, "render_height"),
+        ({"path": nerfstudio(camera_path=[{"camera_to_world": POSE, "fov": 0}])}, "fov"),
+        ({"path": nerfstudio(camera_path=[{"camera_to_world": [0] * 16, "fov": 50}])}, "path"),
+        ({"path": {"keys": [[]]}}, "path"),
         ({"path": "spiral"}, "path"),
         ({"background": "mauve"}, "background"),
         ({"width": 0}, "width"),
@@ -174,3 +186,14 @@ def test_a_damaged_task_hides_no_other_and_can_be_deleted(client: TestClient, mo
     assert [task["id"] for task in client.get(f"/jobs/{model}/tasks").json()["tasks"]] == [other["id"]]
     assert client.delete(address).status_code == 204
     assert not task_folder.exists()
+
+
+def test_a_task_that_fails_names_no_folder_of_the_service(client: TestClient, jobs: JobQueue, finished: str) -> None:
+    evaluation = ask(client, f"/jobs/{finished}/evaluate")
+    capture = jobs.store.trained_on(finished)
+    (capture / "transforms_test.json").write_text("broken")
+    with working(jobs):
+        evaluation = ended(client, evaluation)
+    assert evaluation["state"] == "failed"
+    assert "transforms_test.json" in evaluation["error"]
+    assert str(jobs.store.root) not in evaluation["error"]
