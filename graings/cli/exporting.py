@@ -8,23 +8,10 @@ from typing import Annotated
 import typer
 
 from graings.cli.terminal import busy_status, print_line
-from graings.export.export import (
-    FRAMES,
-    MODEL,
-    PAGE,
-    SEQUENCE,
-    WHOLE,
-    ExportRequest,
-    export_format,
-    export_splats,
-)
+from graings.export.export import FRAMES
 from graings.export.selection import Selection
-from graings.player.html import player_html
-from graings.player.scene_file import read_scene, scene_bytes
-from graings.storage.compact import open_model, write_compact
-from graings.storage.files import write_bytes
-from graings.storage.model import Model
-from graings.storage.model import scene_bytes as model_bytes
+from graings.player.export_file import export_file, export_request
+from graings.storage.compact import open_model
 
 ModelPath = Annotated[
     Path, typer.Argument(metavar="RUN", help="Folder of a run, one of its checkpoints, or an exported .graings file.")
@@ -64,42 +51,14 @@ def export(
     `graings render` accepts a .graings file in place of a run, and shows files of splats.
     """
     try:
-        format = export_format(output)
         selection = Selection(box, sphere, seen)
-        request = None if format in WHOLE else ExportRequest(format, time, frames, degree, selection)
-        if request is None and selection != Selection():
-            raise ValueError(f"a .{format} file holds the whole scene; --box, --sphere and --seen are for splats")
+        request = export_request(output, time=time, frames=frames, degree=degree, selection=selection)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
     model = open_model(run)
-    if request is None and format != MODEL:
-        _export_player(model, format, output)
-        return
-    if request is None:
-        size = write_compact(model, output)
-        print_line(f"{output}: {size / 1e6:.2f} MB, {model_bytes(model.scene) / 1e6:.2f} MB in float32.")
-        return
-    with busy_status("fitting spherical harmonics to the colours"):
+    with busy_status("finding the colours and the motion"):
         try:
-            exported = export_splats(model, request)
+            line = export_file(model, output, request)
         except ValueError as error:
             raise typer.BadParameter(str(error)) from error
-    write_bytes(output, exported.data)
-    times = f"{request.frames} times" if format == SEQUENCE else f"t = {time:g}"
-    print_line(
-        f"{output}: {len(exported.data) / 1e6:.2f} MB, {exported.splats:,} splats at {times}, "
-        f"harmonics of degree {exported.degree}; {exported.dropped:,} dropped."
-    )
-
-
-def _export_player(model: Model, format: str, output: Path) -> None:
-    """Write the scene for the player, or a page with both."""
-    with busy_status("finding the functions of time and the colours"):
-        scene = scene_bytes(model)
-        data = player_html(scene, output.stem) if format == PAGE else scene
-    write_bytes(output, data)
-    header = read_scene(scene)[1]
-    print_line(
-        f"{output}: {len(data) / 1e6:.2f} MB, {header.children:,} Gaussians at all times; 99 % of their positions are "
-        f"within {header.position_error.p99:.2f} px."
-    )
+    print_line(f"{output}: {line}.")

@@ -26,14 +26,16 @@ class Selection:
     empty box or sphere.
     """
 
-    box: tuple[float, float, float, float, float, float] | None = None
-    sphere: tuple[float, float, float, float] | None = None
+    box: tuple[float, ...] | None = None
+    sphere: tuple[float, ...] | None = None
     seen: bool = False
 
     def __post_init__(self) -> None:
         for name, values in (("box", self.box), ("sphere", self.sphere)):
             if values is not None and not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite numbers, got {values}")
+        if (self.box is not None and len(self.box) != 6) or (self.sphere is not None and len(self.sphere) != 4):
+            raise ValueError("box must be six numbers, x y z of two corners, and sphere four, x y z and a radius")
         if self.box is not None and any(low >= high for low, high in zip(self.box[:3], self.box[3:], strict=True)):
             raise ValueError(f"box must be x y z of its lower corner, then of its upper one, got {self.box}")
         if self.sphere is not None and self.sphere[3] <= 0:

@@ -41,10 +41,7 @@ class ExportQuery(BaseModel):
 def export(job_id: JobId, here: ContextDep, query: Annotated[ExportQuery, Query()]) -> Response:
     """The newest model of a job as splats. One export is made at a time."""
     try:
-        box, sphere = _numbers(query.box), _numbers(query.sphere)
-        if (box is not None and len(box) != 6) or (sphere is not None and len(sphere) != 4):
-            raise ValueError("box must be six numbers with commas between them, sphere four")
-        selection = Selection(box, sphere, query.seen)
+        selection = Selection(_numbers(query.box), _numbers(query.sphere), query.seen)
         request = ExportRequest(query.format, query.t, query.frames, query.degree, selection)
     except ValueError as error:
         raise BadRequest(f"{error}.") from error
