@@ -56,6 +56,12 @@ class AsyncClient:
             archive = await asyncio.to_thread(stack.enter_context, packed(capture))
             return await self._do(call, chunks(archive, observe))
 
+    async def submit_scene(
+        self, scene: str, *, preset: str = "standard", config: calls.Query | None = None
+    ) -> RemoteJob:
+        """Train on a synthetic scene, which the service draws itself: one of `scenes` in `GET /options`."""
+        return await self._do(calls.submit_scene(scene, preset, config, uuid.uuid4().hex))
+
     async def job(self, job_id: str) -> RemoteJob:
         return await self._do(calls.job(job_id))
 

@@ -57,6 +57,10 @@ class Client:
         with packed(capture) as archive:
             return self._do(call, chunks(archive, observe))
 
+    def submit_scene(self, scene: str, *, preset: str = "standard", config: calls.Query | None = None) -> RemoteJob:
+        """Train on a synthetic scene, which the service draws itself: one of `scenes` in `GET /options`."""
+        return self._do(calls.submit_scene(scene, preset, config, uuid.uuid4().hex))
+
     def job(self, job_id: str) -> RemoteJob:
         return self._do(calls.job(job_id))
 

@@ -74,6 +74,11 @@ def submit(
     return Call("POST", "/jobs", _job, query, headers)
 
 
+def submit_scene(scene: str, preset: str, config: Query | None, key: str) -> Call[RemoteJob]:
+    query = {"scene": scene, "preset": preset, "config": json.dumps(dict(config or {}))}
+    return Call("POST", "/jobs", _job, query, {"Idempotency-Key": key})
+
+
 def job(job_id: str) -> Call[RemoteJob]:
     return Call("GET", f"/jobs/{job_id}", _job)
 

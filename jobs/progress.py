@@ -33,7 +33,9 @@ class ProgressReport(Document):
     phase: Literal["capture", "loading", "warmup", "joint", "static", "diverged"] = Field(
         description="What the job does; `capture` makes one of a video or of photographs."
     )
-    step: str | None = Field(None, description="Part of the phase `capture`: frames, features, matching, mapping, ...")
+    step: str | None = Field(
+        None, description="Part of the phase `capture`: frames, features, matching, mapping, ...; drawing."
+    )
     step_done: int | None = Field(None, ge=0, description="How much of this part is done.")
     step_total: int | None = Field(None, ge=0, description="Its whole.")
     iteration: int = Field(ge=0, description="Iterations done.")

@@ -54,7 +54,7 @@ class JobFolder:
 
     @property
     def capture(self) -> Path:
-        """The capture that was made of a video or of photographs."""
+        """The capture that was made of a video, of photographs, or of a synthetic scene."""
         return self.path / "capture"
 
     @property

@@ -31,8 +31,8 @@ from graings.storage.run_folder import RECORD_FILE
 from graings.training.calibration import calibration
 from graings.training.run import TrainingRun
 from graings.training.run_output import RunReport
+from jobs.capture_phase import Stopped, capture_of
 from jobs.exit_code import ExitCode
-from jobs.footage_phase import Stopped, capture_of
 from jobs.locks import locked
 from jobs.parent import watch_parent
 from jobs.progress import ProgressReport, ProgressWriter, last_progress

@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeVar
 from anyio import BrokenWorkerProcess, to_process
 
 from graings.capture.load import load_capture
+from graings.capture.synthetic import RECIPE_FILE, find_recipe
 from graings.config import CaptureConfig, TrainConfig
 from graings.errors import CaptureError
 from graings.footage.source import find_footage
@@ -71,9 +72,9 @@ async def apart(look: Callable[..., Found | Defect], *arguments: object) -> Foun
 
 def _find_defect(folder: Path, config: CaptureConfig) -> Defect | None:
     root = capture_root(folder)
-    if find_footage(root) is not None:
-        return None  # the job finds its cameras first, and says there what is wrong
     try:
+        if find_recipe(root) is not None or find_footage(root) is not None:
+            return None  # the job makes the capture first; of footage it says there what is wrong
         load_capture(root, config)
     except CaptureError as error:
         return defect(root, error)
@@ -83,9 +84,9 @@ def _find_defect(folder: Path, config: CaptureConfig) -> Defect | None:
 def _make_plan(folder: Path, config: TrainConfig) -> Defect | str:
     """The plan as JSON. The service measures no times itself: it uses the calibration of an earlier training."""
     root = capture_root(folder)
-    if (footage := find_footage(root)) is not None:
-        return _without_cameras("a plan", footage)
     try:
+        if (missing := _without_views("a plan", root)) is not None:
+            return missing
         return survey(root, config, stored_calibration()).model_dump_json(by_alias=True)
     except CaptureError as error:
         return defect(root, error)
@@ -94,15 +95,21 @@ def _make_plan(folder: Path, config: TrainConfig) -> Defect | str:
 def _describe(folder: Path, config: CaptureConfig) -> Defect | str:
     """The inspection as JSON."""
     root = capture_root(folder)
-    if (footage := find_footage(root)) is not None:
-        return _without_cameras("an inspection", footage)
     try:
+        if (missing := _without_views("an inspection", root)) is not None:
+            return missing
         return inspection.inspect_capture(root, config, stored_calibration())[0].model_dump_json(by_alias=True)
     except CaptureError as error:
         return defect(root, error)
 
 
-def _without_cameras(what: str, footage: Path) -> Defect:
+def _without_views(what: str, root: Path) -> Defect | None:
+    """Why there is no `what` of a capture that a job makes first; None for a capture. Raises `CaptureError`."""
+    if find_recipe(root) is not None:
+        remedy = "Submit it as a job, or draw it first: graings synthesize."
+        return Defect(f"{what} needs the images, which are not drawn yet", RECIPE_FILE, None, remedy)
+    if (footage := find_footage(root)) is None:
+        return None
     remedy = "Submit it as a job, or make a capture of it first: graings capture."
     return Defect(f"{what} needs the cameras, which are not known yet", footage.name, None, remedy)
 

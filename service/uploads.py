@@ -19,6 +19,7 @@ from anyio import open_file, to_thread
 from starlette.datastructures import FormData, UploadFile
 from starlette.requests import Request
 
+from graings.capture.synthetic import RECIPE_FILE, SceneRecipe
 from graings.footage.source import video_suffix
 from jobs.leftovers import discard_leftovers
 from service.archives import Limits, unpack
@@ -93,6 +94,19 @@ async def receive_capture(request: Request, uploads: Path, limits: Limits) -> As
         yield Upload(folder, digest, config)
     finally:
         archive.unlink(missing_ok=True)
+        await to_thread.run_sync(lambda: shutil.rmtree(folder, ignore_errors=True))
+
+
+@asynccontextmanager
+async def scene_capture(scene: str, uploads: Path) -> AsyncIterator[Upload]:
+    """The recipe of the synthetic scene of that name, as `receive_capture` gives what is sent."""
+    recipe = json.dumps(SceneRecipe(scene=scene).to_json()).encode()
+    folder = uploads / uuid.uuid4().hex
+    try:
+        folder.mkdir()
+        (folder / RECIPE_FILE).write_bytes(recipe)
+        yield Upload(folder, hashlib.sha256(recipe).hexdigest(), {})
+    finally:
         await to_thread.run_sync(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 

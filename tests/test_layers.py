@@ -82,7 +82,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         *("graings.config", "graings.document", "graings.report.events", "graings.storage.files"),
         "graings.storage.run_folder",
     ),
-    "jobs.footage_phase": ("graings.footage", "jobs"),
+    "jobs.capture_phase": ("graings.capture.synthetic", "graings.footage", "jobs"),
     "jobs.task": ("graings.camera.view_request", "graings.export.camera_path", "graings.storage.files", "jobs"),
     "jobs.task_process": ("graings.export", "graings.kernel", "graings.report.evaluate_run", "jobs"),
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.storage", "graings.training", "jobs"),

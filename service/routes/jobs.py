@@ -14,15 +14,15 @@ from jobs.job import ID_PATTERN, CaptureNotFound, Job, JobSpec, JobState
 from service.access import Caller, CallerDep
 from service.context import Context, ContextDep, JobId
 from service.inspection import inspect_capture
-from service.problems import RESPONSES
+from service.problems import RESPONSES, BadRequest
 from service.schemas import JobPage, JobResource, job_resource, job_summary
-from service.uploads import CAPTURE_BODY, parse_config, receive_capture
+from service.uploads import CAPTURE_BODY, parse_config, receive_capture, scene_capture
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], responses=RESPONSES)
 
 RETRY_AFTER_S = "2"
 
-# Without a body where `capture` names one that was sent before.
+# Without a body where `capture` names one that was sent before, or `scene` a synthetic one.
 OPTIONAL_BODY = {"requestBody": {**CAPTURE_BODY["requestBody"], "required": False}}
 
 
@@ -37,7 +37,10 @@ async def submit(
         str | None, Query(description="Options as a JSON object, nested or with dotted keys, see /options.")
     ] = None,
     priority: Annotated[int, Query(ge=1, le=1_000_000, description="Jobs with a lower number start first.")] = 10,
-    name: Annotated[str, Query(min_length=1, max_length=120, description="Name of the job, for people.")] = "untitled",
+    name: Annotated[
+        str | None,
+        Query(min_length=1, max_length=120, description="Name of the job, for people (default: `scene` or untitled)."),
+    ] = None,
     webhook: Annotated[
         HttpUrl | None, Query(description="Where to POST what happens to the job; signed with its `webhook_secret`.")
     ] = None,
@@ -52,21 +55,30 @@ async def submit(
             description="`capture` of one of your jobs, instead of a body: train on it again.",
         ),
     ] = None,
+    scene: Annotated[
+        str | None,
+        Query(max_length=40, description="A synthetic scene of /options, instead of a body: the job draws it first."),
+    ] = None,
 ) -> JobResource:
     """Queue a training job on the capture in the body: an archive, or a multipart form with one as `capture`."""
     overrides = {} if config is None else parse_config(config, "config")
     # Checked before the body is read, so that a typing error is reported before gigabytes are uploaded.
     again = make_config(preset, overrides)
+    title = name or scene or "untitled"
+    if capture is not None and scene is not None:
+        raise BadRequest("capture, scene: choose one of them.")
     webhook_address = None if webhook is None else str(webhook)
     if capture is not None:
         await to_thread.run_sync(_check_used, context, caller, capture)
         await inspect_capture(context.store.capture(capture), again.capture)
-        spec = JobSpec(name, capture, again.model_dump(mode="json"), priority, caller.owner, webhook_address)
+        spec = JobSpec(title, capture, again.model_dump(mode="json"), priority, caller.owner, webhook_address)
         return _accepted(await to_thread.run_sync(context.jobs.submit, spec, None, idempotency_key), response)
-    async with receive_capture(request, context.store.uploads, context.limits) as upload:
+    uploads = context.store.uploads
+    body = receive_capture(request, uploads, context.limits) if scene is None else scene_capture(scene, uploads)
+    async with body as upload:
         chosen = make_config(preset, {**overrides, **upload.config})
         await inspect_capture(upload.folder, chosen.capture)
-        spec = JobSpec(name, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
+        spec = JobSpec(title, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
         job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder, idempotency_key)
     return _accepted(job, response)
 

@@ -104,6 +104,7 @@ function summary(job) {
   if (!report) return job.state === "running" ? "starting" : ago(job.created_at);
   const done = `${count(report.iteration)} of ${count(report.iterations)}`;
   if (job.state !== "running") return `${done} · ${ago(job.finished_at || job.created_at)}`;
+  if (report.step === "drawing") return `drawing the images: ${count(report.step_done)} of ${count(report.step_total)}`;
   if (report.phase === "capture") return `finding the cameras: ${report.step} ${count(report.step_done)} of ${count(report.step_total)}`;
   if (report.phase === "loading") return "loading the capture";
   return report.eta_s == null ? done : `${done} · ${span(report.eta_s)} left`;

@@ -1,5 +1,6 @@
 // Upload: a capture, as an archive or a folder, with the options of its training.
 
+import { element } from "./format.js";
 import { OptionsForm } from "./options.js";
 import { request } from "./requests.js";
 import { filesOf, tar } from "./tar.js";
@@ -53,8 +54,8 @@ export function uploadForm(submitted) {
     });
   }
 
-  const query = (name) => {
-    const wanted = new URLSearchParams({ preset: form.elements.preset.value, name });
+  const query = (facts) => {
+    const wanted = new URLSearchParams({ preset: form.elements.preset.value, ...facts });
     const changed = options.values();
     if (Object.keys(changed).length) wanted.set("config", JSON.stringify(changed));
     return wanted;
@@ -63,7 +64,7 @@ export function uploadForm(submitted) {
     event.preventDefault();
     if (!capture) return;
     const upload = new XMLHttpRequest(); // fetch does not report the progress of an upload
-    upload.open("POST", `/jobs?${query(capture.name.replace(/\.(zip|tar|tgz|tar\.gz)$/i, ""))}`);
+    upload.open("POST", `/jobs?${query({ name: capture.name.replace(/\.(zip|tar|tgz|tar\.gz)$/i, "") })}`);
     upload.setRequestHeader("Content-Type", "application/octet-stream");
     upload.responseType = "json";
     upload.upload.onprogress = (progress) => ($("sending").value = progress.loaded / progress.total);
@@ -81,7 +82,27 @@ export function uploadForm(submitted) {
     $("sending").hidden = false;
     upload.send(capture.body);
   };
+  const tryScene = (scene) => {
+    $("refused").hidden = true;
+    request(`/jobs?${query({ scene })}`, { method: "POST" }).then((job) => {
+      $("examples").open = false;
+      submitted(job.id);
+    }, (error) => refuse(error.message));
+  };
+  const offer = (scenes) => {
+    const rows = scenes.map(({ name, question }) => {
+      const button = element("button", { type: "button", class: "quiet" }, name);
+      button.onclick = () => tryScene(name);
+      const row = element("li");
+      row.append(button, element("span", {}, question));
+      return row;
+    });
+    $("examples").querySelector("ul").replaceChildren(...rows);
+  };
   choose(null);
 
-  request("/options").then((all) => options.fill(all), (error) => refuse(error.message));
+  request("/options").then((all) => {
+    options.fill(all);
+    offer(all.scenes);
+  }, (error) => refuse(error.message));
 }

@@ -63,6 +63,19 @@ def test_upload_train_and_play(service: str, capture: Path, open_page: OpenPage,
     assert (config["iterations"], config["init"]["points"], config["preset"]) == (ITERATIONS, 200, "draft")
 
 
+def test_a_synthetic_scene_is_tried_without_a_capture(service: str, open_page: OpenPage) -> None:
+    page = open_page(service)
+    page.locator("#examples > summary").click()
+    page.get_by_label("Preset").select_option("draft")
+    page.get_by_role("button", name="flag", exact=True).click()
+    page.locator("#jobs .sub", has_text=re.compile(r"drawing the images: \d+ of \d+")).wait_for()
+    page.locator("#name", has_text="flag").wait_for()
+    page.get_by_role("button", name="Cancel").click()
+    page.locator("#jobs .cancelled").first.wait_for()
+    (job,) = [entry for entry in httpx2.get(f"{service}/jobs").json()["jobs"] if entry["name"] == "flag"]
+    assert httpx2.delete(f"{service}{job['links']['self']}").status_code == 204
+
+
 def test_the_player_shows_what_the_server_renders(service: str, job: str, open_page: OpenPage, tmp_path: Path) -> None:
     page = open_page(f"{service}/#job={job}", viewport={"width": 1200, "height": 900})
     page.locator("#player[data-ready]").wait_for()

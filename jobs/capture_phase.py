@@ -1,10 +1,12 @@
-"""The first phase of a job on a video or on photographs: their capture, in the job's folder."""
+"""The first phase of a job on a video, photographs or a synthetic scene: its capture, in the job's folder."""
 
 from __future__ import annotations
 
+import shutil
 import threading
 from pathlib import Path
 
+from graings.capture.synthetic import find_recipe, synthesize
 from graings.errors import CaptureError
 from graings.footage.make_capture import TRANSFORMS, make_capture
 from graings.footage.report import lines
@@ -20,13 +22,14 @@ class Stopped(Exception):
 def capture_of(
     upload: Path, folder: JobFolder, threads: int, iterations: int, progress: ProgressWriter, stop: threading.Event
 ) -> tuple[Path, list[str]]:
-    """The capture to train on: `upload` itself, or the one that is made of its footage, and lines for the log.
+    """The capture to train on: `upload` itself, or what is made of its footage or recipe; and lines for the log.
 
-    An interrupted call continues where it was. Raises `Stopped` when `stop` is set, and `CaptureError` where the
-    footage does not hold together.
+    An interrupted call continues where it was; a synthetic scene, which takes seconds, begins again. Raises `Stopped`
+    when `stop` is set, and `CaptureError` where the footage does not hold together.
     """
-    footage = find_footage(upload)
-    if footage is None:
+    recipe = find_recipe(upload)
+    footage = None if recipe else find_footage(upload)
+    if recipe is None and footage is None:
         return upload, []
     if (folder.capture / TRANSFORMS).exists():
         return folder.capture, []
@@ -47,6 +50,17 @@ def capture_of(
         if stop.is_set():
             raise Stopped
 
+    if recipe is not None:
+        shutil.rmtree(folder.capture, ignore_errors=True)  # of a trainer that was killed
+        # In this process: those of a pool would outlive a trainer that is killed.
+        synthesize(
+            recipe.scene,
+            folder.capture,
+            **recipe.model_dump(exclude={"scene"}),
+            observe=lambda done, total: observe("drawing", done, total),
+        )
+        return folder.capture, [f"drew the synthetic scene {recipe.scene}"]
+    assert footage is not None
     try:
         report = make_capture(footage, folder.capture, threads=threads, observe=observe)
     except CaptureError as error:
