@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graings.camera.camera import Camera, View
+from graings.gaussians import Gaussians
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
 from graings.scene.motion_basis import MotionBasis
@@ -143,3 +144,15 @@ def low_pass(composition: Composed, camera: Camera) -> float:
         return composition.blur
     relative_rate = composition.sampling.relative_rate(camera)
     return composition.blur * relative_rate * relative_rate  # a power would raise where this is infinite
+
+
+def contributions(view: Composed, camera: Camera) -> Float[Tensor, " gaussian"]:
+    """Sum over the pixels of `camera` of each Gaussian's blending weight, in px."""
+    found = view.gaussians
+    tensors = (found.means, found.quats, found.log_scales, found.opacities, found.colors)
+    means, quats, log_scales, opacities, colors = (tensor.clone() for tensor in tensors)
+    with torch.enable_grad():
+        colors.requires_grad_()
+        gaussians = Gaussians(means, quats, log_scales, opacities, colors, found.uids.clone())
+        image = draw(Composed(gaussians, view.children, view.blur, view.sampling), camera, (0.0, 0.0, 0.0)).color
+        return torch.autograd.grad(image[..., 0].sum(), colors)[0][:, 0]

@@ -57,6 +57,12 @@ class DensityConfig(ConfigSection):
     prune_min_views: int = Field(
         80, ge=1, description="How many views must have seen an anchor before it may be removed (not scaled)."
     )
+    unseen_pixels: float = Field(
+        0.2,
+        ge=0,
+        description="After the last step, anchors are removed whose children each contribute less than this to each "
+        "training view, in px (sum of blending weights). 0: none are.",
+    )
 
 
 class RatesConfig(ConfigSection):

@@ -90,6 +90,7 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
             "memory_mb": 16_384,  # protects the machine; 300 000 anchors
             "new_anchor_opacity": 0.1,
             "prune_from": 24_600,  # 80 % of the joint phase
+            "unseen_pixels": 0.0,
         },
         # Those of Scaffold-GS where it has the parameter, that of DeformNet from Deformable-3DGS.
         "rates": {

@@ -16,10 +16,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from graings.camera.camera import Camera
-from graings.gaussians import Gaussians
-from graings.render import draw
+from graings.render import contributions
 from graings.scene.prepared import PreparedScene
-from graings.scene.scene import Composed
 from graings.scene.splats import MAX_DEGREE, Splats, harmonic_basis
 
 MAX_VIEWS: Final = 100  # evenly chosen if there are more: 16 coefficients need no more directions
@@ -69,18 +67,6 @@ def fit_splats(
         degree = next(d for d in range(highest + 1) if errors[d] <= errors[highest] + _NEGLIGIBLE)
     splats = Splats(means, quats, log_scales, opacities, fits[degree].float(), views[0].blur, views[0].sampling)
     return HarmonicsFit(splats, children, weights.amax(0), tuple(errors[: highest + 1]))
-
-
-def contributions(view: Composed, camera: Camera) -> Float[Tensor, " gaussian"]:
-    """Sum over the pixels of `camera` of each Gaussian's blending weight, in px."""
-    found = view.gaussians
-    tensors = (found.means, found.quats, found.log_scales, found.opacities, found.colors)
-    means, quats, log_scales, opacities, colors = (tensor.clone() for tensor in tensors)
-    with torch.enable_grad():
-        colors.requires_grad_()
-        gaussians = Gaussians(means, quats, log_scales, opacities, colors, found.uids.clone())
-        image = draw(Composed(gaussians, view.children, view.blur, view.sampling), camera, (0.0, 0.0, 0.0)).color
-        return torch.autograd.grad(image[..., 0].sum(), colors)[0][:, 0]
 
 
 def spread(count: int, most: int) -> list[int]:

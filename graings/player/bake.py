@@ -14,9 +14,9 @@ from torch import Tensor
 
 from graings import constants
 from graings.camera.camera import Camera, View
-from graings.export.harmonics_fit import contributions, fit_colors, spread
+from graings.export.harmonics_fit import fit_colors, spread
 from graings.player.scene import PlayerScene
-from graings.render import PreparedScene
+from graings.render import PreparedScene, contributions
 from graings.scene.motion_basis import PLAYER_PIXELS, MotionBasis
 from graings.scene.time_basis import TimeBasis
 

@@ -117,10 +117,8 @@ class GrowthCapped(_Event):
     max_anchors: int = Field(gt=0, description="Anchors that the scene may have.")
 
     def _words(self) -> str:
-        return (
-            f"growth was limited: {self.anchors:,} of at most {self.max_anchors:,} anchors, "
-            "and more qualified than may be added at once"
-        )
+        budget = f"{self.anchors:,} of at most {self.max_anchors:,} anchors"
+        return f"growth was limited: {budget}, and more qualified than may be added at once"
 
 
 class Pruned(_Event):
@@ -133,6 +131,16 @@ class Pruned(_Event):
         return f"pruned {self.anchors:,} anchors"
 
 
+class Unseen(_Event):
+    """After the last step, anchors that no training view shows were removed."""
+
+    kind: Literal["unseen"] = Field("unseen", description=KIND)
+    anchors: int = Field(gt=0, description="How many anchors were removed.")
+
+    def _words(self) -> str:
+        return f"removed {self.anchors:,} anchors that no training view shows"
+
+
 class Thinned(_Event):
     """More anchors were there from the start than the budget allows: a random part of them was removed."""
 
@@ -141,9 +149,8 @@ class Thinned(_Event):
     anchors_after: int = Field(gt=0, description="Anchors after.")
 
     def _words(self) -> str:
-        return (
-            f"thinned {self.anchors_before:,} anchors to {self.anchors_after:,}: the budget leaves no room for growth"
-        )
+        before, after = f"{self.anchors_before:,}", f"{self.anchors_after:,}"
+        return f"thinned {before} anchors to {after}: the budget leaves no room for growth"
 
 
 class GrowthQuiet(_Event):
@@ -274,6 +281,7 @@ Event = Annotated[
     | Grew
     | GrowthCapped
     | Pruned
+    | Unseen
     | Thinned
     | GrowthQuiet
     | PartDropped

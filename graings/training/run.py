@@ -36,6 +36,7 @@ from graings.storage.checkpoint import (
 from graings.storage.run_folder import RECORD_FILE, sole_trainer
 from graings.training.curriculum import missing_motion
 from graings.training.curriculum.restart import RestartState
+from graings.training.density.unseen import drop_unseen
 from graings.training.plan_revision import PlanRevision
 from graings.training.run_output import RunOutput, RunReport, psnr_of_best
 from graings.training.timing import Clock, Rate, evaluation_marks
@@ -257,9 +258,10 @@ class TrainingRun:
     def _finish(self) -> tuple[EvaluationPoint | None, tuple[Event, ...]]:
         """Evaluate all of val, write the last checkpoint, metrics and plots; returns the last point, and events."""
         trainer = self._trainer
+        events = drop_unseen(trainer, self.log)
         point, splits = self.output.evaluate_end(trainer, self.iteration)
         stiffness = self.output.stiffness(trainer)
-        events = stiffness.events(self.iteration)
+        events += stiffness.events(self.iteration)
         self.log.note(events)
         self._save(finished=True)
         compact = self.output.export(trainer)

@@ -263,6 +263,11 @@ class Trainer(TrainerState):
             rate_factor=self.optimizer.damping,
         )
 
+    def keep_anchors(self, keep: Tensor) -> None:
+        """Remove all anchors but those of the mask `keep` [A]."""
+        self.optimizer.keep(keep)
+        self.density.statistics.resize(keep=keep)
+
     def restore(self) -> None:
         """Return to the newest snapshot, and its iteration, for good: training has diverged."""
         snapshot, before = self.snapshots.newest, self.guard

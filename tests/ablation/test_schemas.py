@@ -36,6 +36,7 @@ EVENTS: tuple[Event, ...] = (
     Grew(iteration=200, anchors=3),
     events.GrowthCapped(iteration=200, anchors=90, max_anchors=100),
     events.Pruned(iteration=200, anchors=2),
+    events.Unseen(iteration=200, anchors=2),
     events.Thinned(iteration=200, anchors_before=100, anchors_after=50),
     events.GrowthQuiet(iteration=200, growths=5, ended=True),
     events.PartDropped(iteration=400, component="residual", bound=0.001),
