@@ -73,7 +73,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "graings.training",
     ),
     "graings.cli": (
-        *("graings.ablation", "graings.camera", "graings.capture", "graings.config", "graings.evaluation"),
+        *("graings.ablation", "graings.api", "graings.camera", "graings.capture", "graings.config"),
+        "graings.evaluation",
         *("graings.export", "graings.footage", "graings.inspection", "graings.kernel", "graings.plan"),
         *("graings.player", "graings.render", "graings.report", "graings.storage", "graings.training"),
     ),

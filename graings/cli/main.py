@@ -22,6 +22,7 @@ from graings.camera.viewpoint import background_rgb
 from graings.cli.doctor import doctor
 from graings.cli.exporting import export
 from graings.cli.footage import capture
+from graings.cli.gallery import gallery
 from graings.cli.inspecting import inspect
 from graings.cli.option_table import show_options
 from graings.cli.planning import plan
@@ -95,6 +96,7 @@ app.command(cls=MultiValueCommand)(ablate)
 app.command(name="render")(render_view)
 app.command()(video)
 app.command()(export)
+app.command()(gallery)
 app.command(name="options")(show_options)
 
 

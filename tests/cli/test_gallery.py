@@ -1,0 +1,57 @@
+"""The page of trained models."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+from typer.testing import CliRunner
+
+from graings.capture.synthetic import synthesize
+from graings.cli.main import app
+from graings.config import make_config
+from graings.training.run import TrainingRun
+
+pytest.importorskip("av")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("gallery")
+    capture = synthesize("flag", folder / "flag", size=24, views=6)
+    config = make_config("draft", {"iterations": 8, "init.points": 100, "evaluation.views": 1, "threads": 1})
+    training = TrainingRun.create(capture, folder / "my <flag> #1", config)
+    for _ in training:
+        pass
+    return training.folder
+
+
+def test_a_gallery_has_a_clip_numbers_and_a_player_of_each_run(run: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(run, tmp_path / "second"))
+    output = tmp_path / "gallery"
+    answer = CliRunner().invoke(app, ["gallery", str(run), str(other), "-o", str(output), "--title", "A & B"])
+    assert answer.exit_code == 0, answer.output
+    assert sorted(file.name for file in output.iterdir()) == [
+        "index.html",
+        *("my <flag> #1.html", "my <flag> #1.png", "my <flag> #1.webp"),
+        *("second.html", "second.png", "second.webp"),
+    ]
+    page = (output / "index.html").read_text()
+    assert "<title>A &amp; B</title>" in page
+    assert "my &lt;flag&gt; #1" in page
+    assert "my <flag> #1" not in page
+    assert page.count("deformation of a thin sheet") == 2  # what the scene of the suite asks
+    assert len(re.findall(r"val \d+\.\d\d dB · \d+ min of CPU time · player with scene \d\.\d MB", page)) == 2
+    for link in re.findall(r'(?:href|src|srcset)="([^"]+)"', page):
+        assert (output / unquote(link)).is_file()
+    assert (output / "second.webp").read_bytes()[8:12] == b"WEBP"
+
+
+def test_runs_that_are_not_finished_or_share_a_name_are_refused(run: Path, tmp_path: Path) -> None:
+    twice = CliRunner().invoke(app, ["gallery", str(run), str(run), "-o", str(tmp_path)])
+    assert twice.exit_code == 2
+    assert "rename one" in " ".join(twice.output.split())
+    assert list(tmp_path.iterdir()) == []
