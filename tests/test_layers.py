@@ -118,13 +118,15 @@ HOMES: dict[str, tuple[str, ...]] = {
     "flip_evaluator": ("graings.evaluation.perceptual",),
     "matplotlib": ("graings.report", "graings.ablation.plot", "graings.inspection.picture"),
     "plyfile": ("graings.capture.readers.ply", "graings.export.ply"),
+    "fourdgs": ("graings.export.four_d",),
     "gaussforge": ("graings.export.formats",),
     "av": ("graings.export", "graings.footage.video"),
     "safetensors": ("graings.storage.checkpoint", "graings.storage.compact"),
 }
 
 # Optional extras, and what takes long to import and is not always used.
-MAY_BE_IMPORTED_LATE = {"av", "gaussforge", "pycolmap", "lpips", "flip_evaluator", "matplotlib", "numpy", "PIL"}
+MAY_BE_IMPORTED_LATE = {"av", "fourdgs", "gaussforge", "pycolmap", "lpips", "flip_evaluator", "matplotlib"}
+MAY_BE_IMPORTED_LATE |= {"numpy", "PIL"}
 
 FORBIDDEN_NAMES = {"util", "utils", "helper", "helpers", "manager", "misc", "common", "tools"}
 

@@ -87,7 +87,7 @@ def export_model(
     """Write a model in the format that the suffix of `path` names; returns a line on its size and content.
 
     With all times: .graings, .html, .scene.gz. At the time `t`: .ply, .compressed.ply, .spz, .sog, .splat, .glb. At
-    `frames` times: .zip. `degree`, `box`, `sphere` and `seen`: as for `graings export`. Raises `ValueError`, and
+    `frames` times: .zip, .4dgs. `degree`, `box`, `sphere` and `seen`: as for `graings export`. Raises `ValueError`, and
     `CheckpointError` for the model.
     """
     selection = Selection(None if box is None else tuple(box), None if sphere is None else tuple(sphere), seen)

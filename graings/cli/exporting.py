@@ -27,11 +27,11 @@ def export(
             "-o",
             help="File to write: .graings, the whole model; .html, a page that plays it, or its .scene.gz; at one time "
             ".ply, .compressed.ply, .spz, .sog, .splat "
-            "or .glb; .zip, a sequence of PLY files.",
+            "or .glb; .zip, a sequence of PLY files; .4dgs, pieces of straight motion.",
         ),
     ],
     time: Annotated[float, typer.Option("--time", "--t", help="Time from 0 to 1 of the splats.")] = 0.0,
-    frames: Annotated[int, typer.Option(help="Number of times in a .zip.")] = FRAMES,
+    frames: Annotated[int, typer.Option(help="Number of times in a .zip or .4dgs.")] = FRAMES,
     degree: Annotated[
         int | None,
         typer.Option(min=0, max=3, help="Degree of the spherical harmonics of colour (default: what the scene needs)."),

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from graings.document import Document
 from graings.export.formats import WRITERS, suffix_of
+from graings.export.four_d import four_d_file
 from graings.export.harmonics_fit import fit_splats
 from graings.export.selection import Selection
 from graings.render import PreparedScene
@@ -24,7 +25,9 @@ MODEL: Final = "graings"
 SCENE: Final = "scene.gz"  # for the player (graings.player)
 PAGE: Final = "html"  # the player with its scene
 WHOLE: Final = (MODEL, SCENE, PAGE)  # formats with all times, which have no splats to choose
-FORMATS: Final = (*WRITERS, SEQUENCE)
+FOUR_D: Final = "4dgs"
+SEVERAL: Final = (SEQUENCE, FOUR_D)  # formats with several times
+FORMATS: Final = (*WRITERS, *SEVERAL)
 FRAMES: Final = 30
 MAX_FRAMES: Final = 10_000
 
@@ -51,7 +54,7 @@ class SequenceManifest(Document):
 
 @dataclass(frozen=True, slots=True)
 class ExportRequest:
-    """What to export: the time in [0, 1], or for a sequence the number of `frames` evenly over it.
+    """What to export: the time in [0, 1], or for `zip` and `4dgs` the number of `frames` evenly over it.
 
     `degree` of the harmonics: 0 to 3, or None for what the scene needs. Raises `ValueError` for values out of range.
     """
@@ -95,6 +98,9 @@ def export_format(path: Path) -> str:
 def export_splats(model: Model, request: ExportRequest) -> Exported:
     """`model` in the format of `request`. Raises `ValueError` where nothing is left, and `CheckpointError`."""
     scene = PreparedScene(model.scene)
+    if request.format == FOUR_D:
+        found = four_d_file(model, request.frames, request.degree, request.selection)
+        return Exported(found.data, found.records, found.dropped, found.degree)
     if request.format != SEQUENCE:
         splats, dropped = _splats(model, scene, request, request.time, request.degree)
         return Exported(WRITERS[request.format](splats, model.units), len(splats), dropped, splats.degree)

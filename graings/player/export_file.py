@@ -8,7 +8,7 @@ from graings.export.export import (
     FRAMES,
     MODEL,
     PAGE,
-    SEQUENCE,
+    SEVERAL,
     WHOLE,
     ExportRequest,
     export_format,
@@ -51,7 +51,7 @@ def export_file(model: Model, path: Path, request: ExportRequest | None) -> str:
     if request is not None:
         exported = export_splats(model, request)
         write_bytes(path, exported.data)
-        times = f"{request.frames} times" if request.format == SEQUENCE else f"t = {request.time:g}"
+        times = f"{request.frames} times" if request.format in SEVERAL else f"t = {request.time:g}"
         return (
             f"{len(exported.data) / 1e6:.2f} MB, {exported.splats:,} splats at {times}, "
             f"harmonics of degree {exported.degree}; {exported.dropped:,} dropped"

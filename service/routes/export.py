@@ -27,10 +27,10 @@ class ExportQuery(BaseModel):
 
     format: str = Field(
         json_schema_extra={"enum": list(FORMATS)},
-        description="ply, compressed.ply, spz, sog, splat, glb, or zip: a sequence of PLY files.",
+        description="ply, compressed.ply, spz, sog, splat, glb, zip: a sequence of PLY files, or 4dgs.",
     )
     t: float = Field(0.0, ge=0, le=1, description="Time.")
-    frames: int = Field(FRAMES, ge=1, le=MAX_FRAMES, description="Number of times in a zip.")
+    frames: int = Field(FRAMES, ge=1, le=MAX_FRAMES, description="Number of times in a zip or 4dgs.")
     degree: int | None = Field(None, ge=0, le=3, description="Of the spherical harmonics; default: what is needed.")
     box: str | None = Field(None, max_length=240, description="Keep what is in x,y,z,x,y,z, the capture's units.")
     sphere: str | None = Field(None, max_length=160, description="Keep what is in x,y,z,radius.")
