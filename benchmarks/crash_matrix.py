@@ -27,6 +27,7 @@ from crash.faults import FAULTS, Around, Fault, faked_clock
 from crash.rows import Matrix, Row, digest, table, trained_twice
 from crash.stage import Stage, Stuck, small_disk
 
+from client import ClientError
 from graings.capture.synthetic import write_synthetic
 from graings.report.machine import machine_facts, version_facts
 from tests.jobs.postgres_server import is_installed, running
@@ -68,7 +69,10 @@ def prepared(fault: Fault, backend: str, capture: Path, stack: ExitStack) -> Ite
     if fault.clock:
         around.clock, environment = stack.enter_context(faked_clock(folder))
         stage.environment |= environment
-    yield stage, around
+    try:
+        yield stage, around
+    finally:
+        stage.end()
 
 
 def run(fault: Fault, backend: str, capture: Path, expected: str | None, logs: Path | None) -> tuple[Row, str]:
@@ -87,8 +91,10 @@ def run(fault: Fault, backend: str, capture: Path, expected: str | None, logs: P
             recovery_s = round(time.monotonic() - stage.over_at, 1)
             for job_id in (stage.job, stage.behind):
                 stage.until(lambda job_id=job_id: stage.ended(job_id), "the job ends")
-        except (Stuck, RuntimeError) as error:
+        except (Stuck, RuntimeError, ClientError) as error:
             stuck = str(error)
+        if not stage.behind:
+            return Row(**facts, stuck=stuck, notes=("the fault could not be tried",)), ""
         jobs = [stage.job_now(job_id) for job_id in (stage.job, stage.behind)]
         stage.end()
         found = digest(stage)

@@ -41,8 +41,11 @@ typer.run(commands.worker)
 UPGRADED = """
 import typer
 import graings
-from jobs import commands, engine
-graings.__version__, engine.VERSION = "99.0", "jobs-99"
+from dbos import DBOS
+from jobs import commands
+graings.__version__ = "99.0"
+step = DBOS.step
+DBOS.step = lambda *, name, **options: step(name=f"new-{name}", **options)
 typer.run(commands.worker)
 """
 
@@ -285,7 +288,7 @@ def same_name(stage: Stage, around: Around) -> None:
     stage.until(lambda: stage.start_worker(program=("-c", NAMED)).poll() is None, "the name is free")
 
 
-@fault("worker-upgrade", "worker killed; one of another version of program and workflow started")
+@fault("worker-upgrade", "worker killed; one of another version, with other steps of the workflow, started")
 def worker_upgrade(stage: Stage, around: Around) -> None:
     owner(stage).kill()
     stage.over()
@@ -319,9 +322,8 @@ def machine_gone(stage: Stage, around: Around) -> None:
     around.cable.cut()
     stage.kill(stage.workers[0].pid, *stage.trainers())
     stage.over()
-    stage.watch(
-        ("its lease ends", lambda: around_alive(stage) == 2), ("taken over", lambda: len(stage.folder.attempts()) == 2)
-    )
+    stage.watch("its lease ends", lambda: around_alive(stage) == 2)
+    stage.watch("the next attempt begins", lambda: len(stage.folder.attempts()) == 2)
 
 
 @fault(

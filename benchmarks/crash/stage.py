@@ -40,7 +40,9 @@ class Stage:
 
     def __init__(self, data: Path, logs: Path, url: str, capture: Path) -> None:
         self.data, self.logs, self.url, self.capture = data, logs, url, capture
-        self.environment: dict[str, str] = {}
+        self.environment = {"GRAINGS_MIN_FREE_MB": "0"}
+        self.job = self.behind = ""
+        self.api: subprocess.Popen[bytes] | None = None
         self.workers: list[subprocess.Popen[bytes]] = []
         self.notes: list[str] = []
         self.late: list[Callable[[], object]] = []  # what starts once the first worker trains
@@ -154,11 +156,12 @@ class Stage:
 
     def end(self) -> None:
         """Stop everything, also what a fault left behind."""
-        for process in (*self.workers, self.api):
+        started = [*self.workers, *([] if self.api is None else [self.api])]
+        for process in started:
             if process.poll() is None:
                 process.send_signal(signal.SIGCONT)
                 process.terminate()
-        for process in (*self.workers, self.api):
+        for process in started:
             try:
                 process.wait(60)
             except subprocess.TimeoutExpired:
