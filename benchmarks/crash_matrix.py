@@ -1,7 +1,7 @@
 """The crash matrix: every fault on every backend, with the real processes of API, workers and trainers.
 
-    python benchmarks/crash_matrix.py [--faults trainer-kill disk-database] [--backends sqlite] [--markdown FILE]
-        [--json FILE]
+    python benchmarks/crash_matrix.py [--faults trainer-kill disk-database] [--backends sqlite] [--json FILE]
+    python benchmarks/crash_matrix.py --merge FILE FILE --markdown FILE
 
 Each row is a service of its own: two jobs are submitted over HTTP, the fault comes while the first trains, and when its
 cause is gone both jobs must end, neither lost nor trained twice at once, with the model of an undisturbed training to
@@ -114,6 +114,15 @@ def run(fault: Fault, backend: str, capture: Path, expected: str | None, logs: P
     return row, found
 
 
+def write(parts: list[Matrix], file: Path | None) -> None:
+    """The table of all parts as Markdown: of rows of the same fault and backend the last one."""
+    rows = {(row.fault, row.backend): row for part in parts for row in part.rows}
+    ordered = sorted(rows.values(), key=lambda row: list(FAULTS).index(row.fault))
+    origins = [f"`{part.command}`, commit {part.commit}, {part.machine}" for part in parts]
+    if file is not None:
+        file.write_text("\n".join([*(f"- {origin}" for origin in origins), "", table(ordered), ""]))
+
+
 def main() -> None:
     """Try the faults and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -122,7 +131,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the rows to this file, after each row")
     parser.add_argument("--markdown", type=Path, help="write the table to this file")
     parser.add_argument("--logs", type=Path, help="keep the logs of rows with a defect in this folder")
+    parser.add_argument("--merge", nargs="+", type=Path, help="try nothing: join the rows of these files")
     arguments = parser.parse_args()
+    if arguments.merge:
+        parts = [Matrix.model_validate_json(file.read_text()) for file in arguments.merge]
+        write(parts, arguments.markdown)
+        return
     names = ["none", *(name for name in arguments.faults if name != "none")]
     rows: list[Row] = []
     expected: str | None = None
@@ -147,9 +161,7 @@ def main() -> None:
                 )
                 if arguments.json is not None:
                     arguments.json.write_text(matrix.model_dump_json(indent=1))
-    text = f"`{matrix.command}`, commit {matrix.commit}, {matrix.machine}.\n\n{table(rows)}\n"
-    if arguments.markdown is not None:
-        arguments.markdown.write_text(text)
+    write([matrix], arguments.markdown)
     defects = sum(not row.passed and row.skipped is None for row in rows)
     print(f"{len(rows)} rows, {defects} with a defect")
     sys.exit(1 if defects else 0)

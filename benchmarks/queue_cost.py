@@ -122,9 +122,9 @@ def measure(backend: str, url: str, folder: Path, slots: int, jobs: int) -> Row:
     page, _ = queue.page(50)
     list_ms = 1e3 * (time.perf_counter() - started)
     assert len(page) == min(50, jobs)
-    ended = [entry.state for entry in engine.entries(ids).values()]
-    if ended.count(JobState.SUCCEEDED) != jobs:
-        raise RuntimeError(f"{jobs - ended.count(JobState.SUCCEEDED)} of {jobs} jobs did not succeed")
+    others = [entry for entry in engine.entries(ids).values() if entry.state is not JobState.SUCCEEDED]
+    if others:
+        raise RuntimeError(f"{len(others)} of {jobs} jobs did not succeed, as {others[0]}")
     engine.close()
     sizes = subprocess.run(["du", "-sk", store.folder(ids[0]).path], check=True, capture_output=True, text=True)
     return Row(

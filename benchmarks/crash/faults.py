@@ -337,7 +337,7 @@ def worker_cut(stage: Stage, around: Around) -> None:
     around.cable.cut()
     began = time.monotonic()
     stage.over()
-    stage.watch("taken over or trained", lambda: len(stage.folder.attempts()) == 2 or stage.folder.metrics.exists())
+    stage.watch("its lease ends", lambda: around_alive(stage) == 2)
     time.sleep(max(0.0, CUT_S - (time.monotonic() - began)))
     around.cable.mend()
     stage.over()

@@ -71,7 +71,7 @@ class Stage:
         return self.workers[-1]
 
     def client(self) -> Client:
-        return Client(f"http://127.0.0.1:{self._port}", timeout=20.0)
+        return Client(f"http://127.0.0.1:{self._port}", timeout=90.0)
 
     def answers(self) -> bool:
         """Whether the API answers and has the database."""

@@ -89,6 +89,20 @@ def test_leases_raise_while_the_database_is_stopped_and_work_after_its_restart(s
     observer.close()
 
 
+def test_the_server_notices_within_half_a_minute_that_the_machine_of_a_lease_is_gone(url: str, tmp_path: Path) -> None:
+    leases = open_leases(url, tmp_path)
+    assert isinstance(leases, PostgresLeases)
+    for _ in range(2):  # the first session, and the one after it was closed
+        idle, interval, count = (
+            int(str(leases._value(f"select current_setting('tcp_keepalives_{name}')")))
+            for name in ("idle", "interval", "count")
+        )
+        assert 0 < idle + interval * count <= 30
+        leases._connection.close()
+        leases.alive()
+    leases.close()
+
+
 def test_leases_in_other_databases_of_the_server_do_not_count(url: str, tmp_path: Path) -> None:
     with psycopg.connect(url, autocommit=True) as connection:
         connection.execute("create database other")
