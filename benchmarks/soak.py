@@ -1,6 +1,6 @@
 """A soak test: clients that look at scenes and train for minutes, and what that does to latency, memory and files.
 
-    python benchmarks/soak.py -o FOLDER [--minutes 20] [--clients 20] [--side 128]
+    python benchmarks/soak.py -o FOLDER [--minutes 20] [--clients 20] [--pause 0.2] [--side 128]
 
 Starts `graings serve --with-worker` on a temporary data folder and trains one model. Then two of the clients submit
 short trainings, wait for their end and delete them, two list jobs and read the numbers of one, and all others ask for
@@ -33,7 +33,6 @@ from graings.report.figure_files import INK, style, svg
 from graings.report.machine import machine_facts, version_facts
 
 TRAINING = {"iterations": 60, "init.points": 200, "evaluation.views": 1}
-PAUSE_S = 0.2
 WINDOWS = 30  # rows of a run
 TRAINERS, LISTERS = 2, 2
 
@@ -127,7 +126,7 @@ def trains(client: Client, tally: Tally, capture: Path) -> None:
     tally.add("trainings")
 
 
-def keep_asking(port: int, ask: Callable[[Client], None], tally: Tally, ended: threading.Event) -> None:
+def keep_asking(port: int, ask: Callable[[Client], None], tally: Tally, ended: threading.Event, pause_s: float) -> None:
     """One client: asks until the run has ended."""
 
     def refused(response: object) -> None:
@@ -136,7 +135,7 @@ def keep_asking(port: int, ask: Callable[[Client], None], tally: Tally, ended: t
             tally.add("refused")
 
     with Client(f"http://127.0.0.1:{port}", timeout=120.0, event_hooks={"response": [refused]}) as client:
-        while not ended.wait(PAUSE_S):
+        while not ended.wait(pause_s):
             try:
                 ask(client)
             except ClientError as error:
@@ -205,6 +204,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=20.0)
     parser.add_argument("--clients", type=int, default=20)
+    parser.add_argument("--pause", type=float, default=0.2, help="seconds between the requests of a client")
     parser.add_argument("--side", type=int, default=128)
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
@@ -221,7 +221,9 @@ def main() -> None:
             for seed in range(arguments.clients - len(asks)):
                 chance = random.Random(seed)
                 asks.append(lambda client, chance=chance: looks(client, tally, job, arguments.side, chance))
-            threads = [threading.Thread(target=keep_asking, args=(port, ask, tally, ended)) for ask in asks]
+            threads = [
+                threading.Thread(target=keep_asking, args=(port, ask, tally, ended, arguments.pause)) for ask in asks
+            ]
             for thread in threads:
                 thread.start()
             began = time.monotonic()
