@@ -90,7 +90,8 @@ class ChildProcess:
 def _lower_priority(pid: int, nice: int) -> None:
     """Lower the priority of a process that has just been started; threads that it will start inherit it."""
     lowered = min(19, os.getpriority(os.PRIO_PROCESS, 0) + nice)
-    os.setpriority(os.PRIO_PROCESS, pid, lowered)
+    with suppress(ProcessLookupError):  # it has ended already
+        os.setpriority(os.PRIO_PROCESS, pid, lowered)
     # Desktops schedule each session as a group first, and the child has a session of its own: there only the priority
     # of the group counts against other sessions.
     with suppress(OSError):  # no such groups here

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping, Sequence, Set
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, cast
 
 import psycopg  # DBOS depends on it and on SQLAlchemy
 from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, EnqueueOptions, WorkflowStatus
@@ -22,13 +22,13 @@ from sqlalchemy import exc
 from jobs.database_url import SQLITE_PREFIX, cannot_open, no_answer, with_connection_limits
 from jobs.job import JobConflict, JobState, Outcome
 
+# Queues, whose workflows have the same names.
 QUEUE = "train"
-WORKFLOW = "train"
-MESSAGES = "messages"  # the queue and the workflow of webhooks
-TASKS = "tasks"  # those of evaluations and videos
+MESSAGES = "messages"  # webhooks
+TASKS = "tasks"  # evaluations and videos
 APPLICATION = "graings"
-# The version of the workflow's steps, not of the program: DBOS gives an interrupted job only to workers of the same
-# version. Increase it only when the steps change.
+# Never changes: DBOS gives an interrupted job only to workers of the same version, and a worker of any version can
+# continue one, because its progress is on disk.
 VERSION = "jobs-1"
 POLL_S = 0.5
 
@@ -40,7 +40,7 @@ _CONNECTION_ERRORS = (
     psycopg.OperationalError,
     dbos_error.DBOSQueryTimeoutError,
 )
-_QUEUES = (QUEUE, MESSAGES, TASKS)  # their workflows have the same names
+_QUEUES = (QUEUE, MESSAGES, TASKS)
 _STATES = {
     "DELAYED": JobState.QUEUED,
     "ENQUEUED": JobState.QUEUED,
@@ -90,32 +90,21 @@ class Engine:
 
     def enqueue(self, job_id: str, priority: int) -> None:
         """Put a job in the queue; a job that is already there is not changed."""
-        options: EnqueueOptions = {
-            "workflow_name": WORKFLOW,
-            "queue_name": QUEUE,
-            "workflow_id": job_id,
-            "priority": priority,
-        }
-        with self._connection_errors():
-            self._client.enqueue(options, job_id)
+        self._enqueue(QUEUE, job_id, {"priority": priority}, job_id)
 
     def send(self, message_id: str, job_id: str, content: dict[str, Any], attempt: int = 0, delay_s: float = 0) -> None:
         """Have a worker deliver a message to the webhook of a job; one that is already there is not sent twice."""
-        options: EnqueueOptions = {
-            "workflow_name": MESSAGES,
-            "queue_name": MESSAGES,
-            "workflow_id": f"{message_id}.{attempt}",
-        }
-        if delay_s:
-            options["delay_seconds"] = delay_s
-        with self._connection_errors():
-            self._client.enqueue(options, message_id, job_id, content, attempt)
+        delay = {"delay_seconds": delay_s} if delay_s else {}
+        self._enqueue(MESSAGES, f"{message_id}.{attempt}", delay, message_id, job_id, content, attempt)
 
     def enqueue_task(self, task: str, job_id: str, number: str) -> None:
         """Put the task `number` of a job in the queue, as the entry `task`."""
-        options: EnqueueOptions = {"workflow_name": TASKS, "queue_name": TASKS, "workflow_id": task}
+        self._enqueue(TASKS, task, {}, job_id, number)
+
+    def _enqueue(self, queue: str, entry: str, more: Mapping[str, Any], *arguments: Any) -> None:
+        options = {**more, "workflow_name": queue, "queue_name": queue, "workflow_id": entry}
         with self._connection_errors():
-            self._client.enqueue(options, job_id, number)
+            self._client.enqueue(cast(EnqueueOptions, options), *arguments)
 
     def entries(self, job_ids: Sequence[str]) -> dict[str, QueueEntry]:
         """The entries of these jobs by id, without those that are not in the queue."""
@@ -127,32 +116,29 @@ class Engine:
 
     def running(self) -> list[QueueEntry]:
         """All jobs that a worker has taken, also those of workers that died."""
-        return [_entry(status) for status in self._in_state("PENDING")]
+        return [_entry(status) for status in self._in_state("PENDING", QUEUE)]
 
     def waiting(self) -> int:
         """How many jobs wait for a worker."""
-        return len(self._in_state("ENQUEUED"))
+        return len(self._in_state("ENQUEUED", QUEUE))
 
-    def at_work(self) -> set[str]:
-        """The workers that have taken anything from the queue, also those that died."""
-        statuses = [status for name in _QUEUES for status in self._in_state("PENDING", name)]
-        return {status.executor_id for status in statuses if status.executor_id is not None}
+    def taken(self, executor: str | None = None) -> dict[str, str | None]:
+        """What a worker has taken (None: any, also one that died): jobs, messages and tasks, with the worker's id."""
+        statuses = self._in_state("PENDING", *_QUEUES)
+        return {status.workflow_id: status.executor_id for status in statuses if executor in (None, status.executor_id)}
 
-    def requeue_work_of(self, executor: str) -> list[str]:
-        """Put back in the queue what a worker has taken that died or ends: ids of jobs, messages and tasks."""
-        found: list[str] = []
+    def put_back(self, taken: Collection[str]) -> None:
+        """Put back in the queue what a worker has taken."""
         for name in _QUEUES:
-            taken = [status.workflow_id for status in self._in_state("PENDING", name) if status.executor_id == executor]
-            if taken:
+            ids = [status.workflow_id for status in self._in_state("PENDING", name) if status.workflow_id in taken]
+            if ids:
                 with self._connection_errors():
                     # Without a name they would go to DBOS's internal queue, which has no limit on concurrency.
-                    self._client.resume_workflows(list(taken), queue_name=name)
-            found += taken
-        return found
+                    self._client.resume_workflows(ids, queue_name=name)
 
-    def _in_state(self, status: str, name: str = WORKFLOW) -> list[WorkflowStatus]:
+    def _in_state(self, status: str, *names: str) -> list[WorkflowStatus]:
         with self._connection_errors():
-            return self._client.list_workflows(status=status, name=name, load_input=False, load_output=False)
+            return self._client.list_workflows(status=status, name=list(names), load_input=False, load_output=False)
 
     def cancel(self, job_id: str) -> None:
         """Take a job out of the queue; its worker, if any, stops within two seconds."""
@@ -214,8 +200,10 @@ def executing(
     run: Callable[[str], Awaitable[Outcome]],
     deliver: Callable[[str, str, dict[str, Any], int], None],
     run_task: Callable[[str, str], Awaitable[Outcome]],
-) -> Iterator[None]:
+) -> Iterator[Set[str]]:
     """Take jobs from the queue while the context lasts, `slots` at a time, and await `run(job_id)` for each.
+
+    Yields the ids of what is at work: jobs, messages and tasks.
 
     `deliver` sends one message (id, job, content, attempt), `run_task` does one task (job, task), one at a time. `run`
     and `run_task` are cancelled within two seconds after their work is cancelled or the context ends; they then have
@@ -235,35 +223,46 @@ def executing(
     )
     DBOS(config=config)
 
+    at_work: set[str] = set()
+
+    @contextmanager
+    def working() -> Iterator[None]:
+        at_work.add(str(DBOS.workflow_id))
+        try:
+            yield
+        finally:
+            at_work.discard(str(DBOS.workflow_id))
+
     @DBOS.step(name="run", preemptible=True)
     async def step(job_id: str) -> dict[str, Any]:
-        outcome = await run(job_id)
-        return {"state": outcome.state.value, "error": outcome.error}
+        return asdict(await run(job_id))
 
-    @DBOS.workflow(name=WORKFLOW)
+    @DBOS.workflow(name=QUEUE)
     async def workflow(job_id: str) -> dict[str, Any]:
-        return await step(job_id)
+        with working():
+            return await step(job_id)
 
     @DBOS.workflow(name=MESSAGES)
     def messages(message_id: str, job_id: str, content: dict[str, Any], attempt: int) -> None:
-        DBOS.run_step({"name": "deliver"}, deliver, message_id, job_id, content, attempt)
+        with working():
+            DBOS.run_step({"name": "deliver"}, deliver, message_id, job_id, content, attempt)
 
     @DBOS.step(name="task", preemptible=True)
     async def task_step(job_id: str, number: str) -> dict[str, Any]:
-        outcome = await run_task(job_id, number)
-        return {"state": outcome.state.value, "error": outcome.error}
+        return asdict(await run_task(job_id, number))
 
     @DBOS.workflow(name=TASKS)
     async def task(job_id: str, number: str) -> dict[str, Any]:
-        return await task_step(job_id, number)
+        with working():
+            return await task_step(job_id, number)
 
-    DBOS.listen_queues([QUEUE, MESSAGES, TASKS])
+    DBOS.listen_queues(list(_QUEUES))
     DBOS.launch()
     try:
         DBOS.register_queue(QUEUE, worker_concurrency=slots, polling_interval_sec=POLL_S, on_conflict="always_update")
         DBOS.register_queue(MESSAGES, worker_concurrency=4, polling_interval_sec=POLL_S)
         DBOS.register_queue(TASKS, worker_concurrency=1, polling_interval_sec=POLL_S)
-        yield
+        yield at_work
     finally:
         DBOS.destroy(destroy_registry=True)
 

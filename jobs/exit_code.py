@@ -16,8 +16,6 @@ class ExitCode(IntEnum):
     """Wrong arguments."""
     REFUSED = 65
     """The capture, the options or the checkpoint cannot be used; the message has the remedy. Not tried again."""
-    BUSY = 73
-    """Another process trains in this job folder. Tried once more."""
     STOPPED = 75
     """Stopped by SIGTERM, SIGINT or the end of the parent, at a checkpoint from which training can continue."""
     DIVERGED = 76

@@ -40,7 +40,6 @@ from jobs.store import JobFolder, Store
 
 REPORT_EVERY_S = 1.0
 LOG_EVERY_S = 15.0
-LOCK_WAIT_S = 60.0
 REPORT_BUDGET_S = 10.0  # for rendering the finished model for its report
 
 
@@ -56,14 +55,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         signal.signal(number, lambda *_: stop.set())
     watch_parent(stop.set)
     folder = JobFolder(arguments.folder.resolve())
-    deadline = time.monotonic() + LOCK_WAIT_S
     while not stop.is_set():
-        # The trainer of a worker that was killed may still be writing its last checkpoint: wait for it.
+        # The trainer of a worker that was killed may still be writing its last checkpoint, and that of one that is cut
+        # off from the database may train on: wait for it, however long.
         with locked(folder.lock, wait=False) as acquired:
             if acquired:
                 return _train_or_report(folder, arguments.threads, stop)
-        if time.monotonic() > deadline:
-            return _end(ExitCode.BUSY, f"{folder.path}: another process still trains in this folder. Wait for its end.")
         stop.wait(0.2)
     return ExitCode.STOPPED
 

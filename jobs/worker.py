@@ -14,7 +14,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Set
 from typing import Any, NoReturn
 
 from jobs.child_process import GRACE_S, ChildProcess, ProcessExit
@@ -29,6 +29,7 @@ from jobs.webhooks import RETRY_AFTER_S, WebhookError, deliver
 LOG = logging.getLogger(__name__)
 
 ROUND_S = 2.0
+FORGOTTEN_S = 10.0
 # Attempts in a row without a new checkpoint: those in which the trainer crashed, and those in which the worker died.
 MAX_CRASHES = 2
 MAX_WORKER_DEATHS = 5
@@ -46,6 +47,7 @@ class Worker:
         self._nice = nice
         self._trainers: dict[str, ChildProcess] = {}
         self._told: dict[str, int | None] = {}  # the checkpoint of each trainer that its webhook knows
+        self._idle_since: dict[str, float] = {}  # what we have taken and do not work on
         self._stopping = False
 
     def run(self, stop: threading.Event) -> None:
@@ -59,9 +61,9 @@ class Worker:
         if not leases.acquire(self.id):
             raise JobError(f"The lease of worker {self.id} is held by another process. Start the worker again.")
         try:
-            with executing(self._url, self.id, self._slots, self._work, self._deliver, self._do_task):
+            with executing(self._url, self.id, self._slots, self._work, self._deliver, self._do_task) as at_work:
                 LOG.info("worker %s takes jobs: %d at a time, %d threads each", self.id, self._slots, self._threads)
-                self._supervise(engine, leases, stop)
+                self._supervise(engine, leases, at_work, stop)
                 self._stop_all()
             returned = self._return_jobs(engine)
         finally:
@@ -74,14 +76,14 @@ class Worker:
     def _return_jobs(self, engine: Engine) -> bool:
         """Put our unfinished work back in the queue; False if the database does not answer."""
         try:
-            engine.requeue_work_of(self.id)
+            engine.put_back(engine.taken(self.id))
         except JobError as error:
             # The lease ends with this process, so that other workers requeue these jobs as those of a dead worker.
             LOG.warning("worker %s could not return its jobs, other workers will: %s", self.id, error)
             return False
         return True
 
-    def _supervise(self, engine: Engine, leases: Leases, stop: threading.Event) -> None:
+    def _supervise(self, engine: Engine, leases: Leases, at_work: Set[str], stop: threading.Event) -> None:
         while True:
             try:
                 if not leases.renew(self.id):
@@ -89,11 +91,12 @@ class Worker:
                     return
                 # Before the query: the job of a trainer that starts in between is not in its result yet.
                 trainers = list(self._trainers.items())
-                running = {entry.job_id: entry.executor for entry in engine.running()}
+                taken = engine.taken()
                 self._tell_checkpoints([job_id for job_id, _ in trainers])
-                requeue_work_of_dead_workers(engine, leases, self.id)
+                requeue_work_of_dead_workers(engine, leases, taken, self.id)
+                self._requeue_forgotten(engine, {entry for entry, own in taken.items() if own == self.id} - at_work)
                 for job_id, trainer in trainers:
-                    if running.get(job_id) != self.id and not trainer.stopping:
+                    if taken.get(job_id) != self.id and not trainer.stopping:
                         LOG.warning("job %s was cancelled or given to another worker: stopping its trainer", job_id)
                         trainer.stop()
             except JobError as error:
@@ -104,6 +107,18 @@ class Worker:
                 LOG.exception("worker %s failed to check its jobs", self.id)
             if stop.wait(ROUND_S):
                 return
+
+    def _requeue_forgotten(self, engine: Engine, idle: set[str]) -> None:
+        """Put back what we have taken and do not work on: its end could not be recorded, as on a full disk.
+
+        After a while, because work begins after it is taken, and ends before that is recorded.
+        """
+        now = time.monotonic()
+        self._idle_since = {entry: self._idle_since.get(entry, now) for entry in idle}
+        forgotten = [entry for entry, since in self._idle_since.items() if now - since > FORGOTTEN_S]
+        if forgotten:
+            LOG.warning("the end of %s was not recorded: back in the queue", ", ".join(forgotten))
+            engine.put_back(forgotten)
 
     def _tell(self, job_id: str, event: str, number: int = 0, **changes: Any) -> None:
         """Tell the webhook of a job, if it has one; a database that does not answer must not end the training."""
@@ -203,16 +218,18 @@ class Worker:
                 del self._trainers[job_id]
 
 
-def requeue_work_of_dead_workers(engine: Engine, leases: Leases, own: str) -> None:
+def requeue_work_of_dead_workers(engine: Engine, leases: Leases, taken: Mapping[str, str | None], own: str) -> None:
     """Put jobs, messages and tasks of dead workers back in the queue. Any number of workers may call this at once.
 
-    `own` is the id of this worker.
+    `taken` is who has taken what, `own` the id of this worker.
     """
-    for executor in sorted(engine.at_work() - {own}):
+    for executor in sorted({executor for executor in taken.values() if executor} - {own}):
         if not leases.acquire_from_dead(executor):
             continue  # alive, or another worker requeues its jobs
         try:
-            LOG.warning("worker %s died: back in the queue: %s", executor, ", ".join(engine.requeue_work_of(executor)))
+            left = engine.taken(executor)
+            engine.put_back(left)
+            LOG.warning("worker %s died: back in the queue: %s", executor, ", ".join(left))
         finally:
             leases.release(executor)
 

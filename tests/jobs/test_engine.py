@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -161,3 +163,35 @@ def test_concurrent_retries_of_a_job_all_succeed(tmp_path: Path, engine: Engine)
 
     with ThreadPoolExecutor(8) as pool:
         assert set(pool.map(retry, range(8))) == {JobState.QUEUED}
+
+
+@pytest.mark.slow(reason="waits for the polls of a queue")
+@pytest.mark.parametrize(
+    "enqueue", [lambda engine: engine.enqueue("a", 10), lambda engine: engine.enqueue_task("a", "b", "1")]
+)
+def test_work_whose_end_cannot_be_recorded_is_known_and_can_be_put_back(
+    tmp_path: Path, engine: Engine, enqueue: Callable[[Engine], None]
+) -> None:
+    runs = 0
+
+    async def run(*_: str) -> Outcome:
+        nonlocal runs
+        runs += 1
+        if runs == 1:  # nobody can write from now on, as on a full disk
+            refuse("create trigger full before update on workflow_status begin select raise(abort, 'disk full'); end")
+        return Outcome(JobState.SUCCEEDED)
+
+    def refuse(statement: str) -> None:
+        with closing(sqlite3.connect(tmp_path / "jobs.sqlite", timeout=30)) as database, database:
+            database.execute(statement)
+
+    with executing(engine.url, "worker-a", 1, run, deliver, run) as at_work:
+        enqueue(engine)
+        until(lambda: runs == 1 and not at_work)
+        time.sleep(1.0)
+        refuse("drop trigger full")
+        assert engine.taken() == {"a": "worker-a"}
+        assert engine.taken("worker-b") == {}
+        engine.put_back(engine.taken("worker-a"))
+        until(lambda: state(engine, "a") is JobState.SUCCEEDED)
+        assert (runs, engine.taken(), at_work) == (2, {}, set())

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import pwd
-import shutil
 import signal
-import socket
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,66 +17,19 @@ from jobs.job import JobError, JobState
 from jobs.lease import PostgresLeases, open_leases
 from jobs.queue import JobQueue
 from jobs.store import Store
+from tests.jobs.postgres_server import Server, is_installed, running
 from tests.jobs.test_worker import ENDLESS, is_idle, submit, until, working
 
 pytestmark = pytest.mark.slow(reason="starts a PostgreSQL server and real workers")
 
 
-def _user() -> str | None:
-    """The user that runs the server, which must not be root."""
-    return "postgres" if os.geteuid() == 0 else pwd.getpwuid(os.geteuid()).pw_name
-
-
-class Server:
-    """A PostgreSQL server for the tests, which can be stopped and started again."""
-
-    def __init__(self) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
-        self.url = f"postgresql://grain@127.0.0.1:{self.port}/postgres"
-        self._user = _user()
-        # pytest's folders are closed to other users, so the server's lies beside them.
-        self._data = Path(tempfile.mkdtemp(prefix="grain-postgres-"))
-        shutil.chown(self._data, self._user)
-        command = ["initdb", "-D", self._data, "-U", "grain", "-A", "trust", "-N"]
-        subprocess.run(command, user=self._user, cwd=self._data, check=True)
-        self.start()
-
-    def start(self) -> None:
-        settings = ["-c", f"unix_socket_directories={self._data}", "-c", "fsync=off"]
-        command = ["postgres", "-D", self._data, "-p", str(self.port), *settings]
-        self._process = subprocess.Popen(command, user=self._user, cwd=self._data)
-        ready = ["pg_isready", "-h", "127.0.0.1", "-p", str(self.port), "-q"]
-        until(lambda: subprocess.run(ready, check=False).returncode == 0)
-
-    def stop(self) -> None:
-        self._process.send_signal(signal.SIGINT)  # fast shutdown
-        self._process.wait()
-
-    def remove(self) -> None:
-        self.stop()
-        shutil.rmtree(self._data)
-
-    @contextmanager
-    def stopped(self) -> Iterator[None]:
-        self.stop()
-        try:
-            yield
-        finally:
-            self.start()
-
-
 @contextmanager
 def serving() -> Iterator[Server]:
     """A server for as long as the context lasts; skips the test if PostgreSQL is not installed."""
-    if shutil.which("initdb") is None or shutil.which("postgres") is None:
+    if not is_installed():
         pytest.skip("PostgreSQL is not installed")
-    server = Server()
-    try:
+    with running() as server:
         yield server
-    finally:
-        server.remove()
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +87,20 @@ def test_leases_raise_while_the_database_is_stopped_and_work_after_its_restart(s
     assert not observer.acquire("a")
     holder.close()
     observer.close()
+
+
+def test_the_server_notices_within_half_a_minute_that_the_machine_of_a_lease_is_gone(url: str, tmp_path: Path) -> None:
+    leases = open_leases(url, tmp_path)
+    assert isinstance(leases, PostgresLeases)
+    for _ in range(2):  # the first session, and the one after it was closed
+        idle, interval, count = (
+            int(str(leases._value(f"select current_setting('tcp_keepalives_{name}')")))
+            for name in ("idle", "interval", "count")
+        )
+        assert 0 < idle + interval * count <= 30
+        leases._connection.close()
+        leases.alive()
+    leases.close()
 
 
 def test_leases_in_other_databases_of_the_server_do_not_count(url: str, tmp_path: Path) -> None:

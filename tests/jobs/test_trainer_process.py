@@ -1,8 +1,11 @@
 from __future__ import annotations
 
 import json
+import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import NoReturn
 
@@ -13,9 +16,11 @@ from graings.config import make_config
 from graings.storage.checkpoint import load_model
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
+from jobs.locks import locked
 from jobs.progress import last_progress, read_progress
 from jobs.store import KEPT_ATTEMPTS, JobFolder, Store
 from jobs.trainer_process import _report
+from tests.jobs.test_worker import until
 
 
 def job(store: Store, options: dict[str, object] | None = None) -> JobFolder:
@@ -42,6 +47,30 @@ def test_a_damaged_capture_is_refused_with_a_message_and_its_own_exit_code(tmp_p
         assert process.wait(60) == ExitCode.REFUSED
     assert "train/r_" in json.loads(output)["error"]
     assert folder.checkpoint() is None
+
+
+# A process whose clock runs a thousand times faster.
+HASTY = """
+import runpy, time
+real = time.monotonic
+time.monotonic = lambda: 1000 * real()
+runpy.run_module("jobs.trainer_process", run_name="__main__")
+"""
+
+
+def test_a_trainer_waits_for_another_in_its_folder_however_long_and_then_trains(tmp_path: Path) -> None:
+    folder = job(Store(tmp_path), {"iterations": 2})
+    command = [sys.executable, "-c", HASTY, str(folder.path), "--threads", "1"]
+    with locked(folder.lock), subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        status = Path(f"/proc/{process.pid}/status")
+        until(lambda: int(re.findall(r"SigCgt:\t(\w+)", status.read_text())[0], 16) & 1 << signal.SIGTERM - 1)
+        time.sleep(0.5)
+        assert process.poll() is None
+        assert last_progress(folder.progress) is None
+        process.terminate()
+        assert process.wait(60) == ExitCode.STOPPED
+    with trainer(folder) as process:
+        assert process.wait(60) == ExitCode.DONE
 
 
 def test_a_finished_job_has_its_report(tmp_path: Path) -> None:

@@ -179,8 +179,8 @@ def test_a_message_of_a_dead_worker_is_delivered_by_another(jobs: JobQueue) -> N
             "update workflow_status set status = 'PENDING', executor_id = 'dead' where workflow_uuid = ?",
             (message.workflow_id,),
         )
-    assert engine.at_work() == {"dead"}
-    requeue_work_of_dead_workers(engine, FileLeases(jobs.store.workers), "own")
-    assert engine.at_work() == set()
+    assert engine.taken() == {message.workflow_id: "dead"}
+    requeue_work_of_dead_workers(engine, FileLeases(jobs.store.workers), engine.taken(), "own")
+    assert engine.taken() == {}
     assert [status.workflow_id for status in engine._in_state("ENQUEUED", MESSAGES)] == [message.workflow_id]
     engine.close()

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
 
 from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
+from jobs.child_process import _lower_priority
 from jobs.commands import TRAINING_NICE, default_database
 from jobs.engine import Engine
 from jobs.exit_code import ExitCode
@@ -164,6 +166,28 @@ def test_jobs_are_cancelled_resumed_retried_and_finished(jobs: JobQueue) -> None
         jobs.cancel(endless)
     jobs.delete(endless)
     assert [job.id for job in jobs.page(10)[0]] == [broken, brief]
+
+
+def test_the_priority_of_a_child_that_has_ended_already_stays() -> None:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    _lower_priority(process.pid, 1)  # raises nothing: the job would fail
+
+
+@pytest.mark.slow(reason="waits until a worker is sure that it has forgotten a job")
+def test_a_job_whose_end_could_not_be_recorded_ends_once_it_can_be(jobs: JobQueue) -> None:
+    def change(statement: str) -> None:
+        with closing(sqlite3.connect(jobs.store.root / "jobs.sqlite", timeout=30)) as database, database:
+            database.execute(statement)
+
+    ended = "new.status in ('SUCCESS', 'ERROR')"  # as on a full disk
+    change(f"create trigger full before update on workflow_status when {ended} begin select raise(abort, 'full'); end")
+    job_id = submit(jobs, BRIEF)
+    with working(jobs):
+        until(lambda: jobs.get(job_id).attempts and jobs.store.folder(job_id).attempts()[-1].final)
+        change("drop trigger full")
+        assert jobs.get(job_id).state is JobState.RUNNING
+        until(lambda: jobs.get(job_id).state is JobState.SUCCEEDED)
 
 
 def attempts(*exit_codes: int | None, checkpoint: int = 0, final: bool = False) -> list[Attempt]:
