@@ -22,14 +22,14 @@ MAX_PLANES: Final = 3
 class Table(Document):
     """Where a table is and how its values are restored."""
 
-    name: str
-    rows: int = Field(ge=0)
-    columns: int = Field(ge=0)
+    name: str = Field(description="What the numbers are.")
+    rows: int = Field(ge=0, description="Number of rows.")
+    columns: int = Field(ge=0, description="Number of columns.")
     planes: int = Field(ge=1, le=MAX_PLANES, description="Bytes of each whole number.")
     delta: bool = Field(description="Whether numbers are differences to the row before.")
     start: int = Field(ge=0, description="First byte after the header.")
-    offsets: tuple[float, ...] = Field(description="Of each column.")
-    steps: tuple[float, ...] = Field(description="Of each column.")
+    offsets: tuple[float, ...] = Field(description="Value of the number 0, for each column.")
+    steps: tuple[float, ...] = Field(description="Value of one step, for each column.")
 
     @property
     def bytes(self) -> int:
