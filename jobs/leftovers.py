@@ -13,8 +13,8 @@ LOG = logging.getLogger(__name__)
 LEFTOVER_S = 3_600.0
 
 
-def discard_leftovers(uploads: Path) -> None:
-    """Remove the uploads of processes that died; uploads of running processes stay.
+def discard_leftovers(uploads: Path, after_s: float = LEFTOVER_S) -> None:
+    """Remove the uploads without a write for `after_s`, of processes that died; uploads of running ones stay.
 
     A file that cannot be removed is only logged, so that it does not prevent the next upload.
     """
@@ -24,7 +24,7 @@ def discard_leftovers(uploads: Path) -> None:
         groups.setdefault(path.name.partition(".")[0], []).append(path)
     for paths in groups.values():
         try:
-            if time.time() - max(_last_write(path) for path in paths) < LEFTOVER_S:
+            if time.time() - max(_last_write(path) for path in paths) < after_s:
                 continue
             for path in paths:
                 if path.is_dir():

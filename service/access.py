@@ -55,9 +55,13 @@ class Caller:
 
     def sees(self, job_id: str, spec: JobSpec) -> bool:
         """Whether the job is one of the caller's."""
-        if self.key is None or self.scope is Scope.ADMIN:
-            return True
-        return job_id == self.key.job if self.key.job is not None else spec.owner == self.owner
+        if self.key is not None and self.key.job is not None:
+            return job_id == self.key.job
+        return self.owns(spec.owner)
+
+    def owns(self, owner: str | None) -> bool:
+        """Whether what the key `owner` made is the caller's."""
+        return self.key is None or self.scope is Scope.ADMIN or owner == self.owner
 
 
 def identify(request: Request, context: Context, secret: str | None) -> Caller:

@@ -21,7 +21,7 @@ from service.admission import Admission
 from service.body_limit import BodyLimit
 from service.context import MB, open_context
 from service.head import Head
-from service.routes import captures, export, jobs, plans, render, results, scenes, sessions, system, tasks
+from service.routes import captures, export, jobs, plans, render, results, scenes, sessions, system, tasks, uploads
 from service.same_origin import SameOrigin
 from service.security_headers import SecurityHeaders
 from service.settings import Settings
@@ -58,8 +58,9 @@ def create_app(settings: Settings) -> FastAPI:
             await to_thread.run_sync(app.state.context.close)
 
     def limit(method: str, path: str) -> int:
-        uploads = method == "POST" and path in ("/jobs", "/plans", "/captures")
-        return settings.max_upload_mb * MB if uploads else _SMALL_BODY
+        whole = method == "POST" and path in ("/jobs", "/plans", "/captures")
+        part = method == "PUT" and path.startswith("/uploads/")
+        return settings.max_upload_mb * MB if whole or part else _SMALL_BODY
 
     app = Service(
         title="GrainGS",
@@ -79,7 +80,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_middleware(Head)
     app.add_middleware(SecurityHeaders)
     app.add_middleware(Telemetry, registry=registry)
-    for routes in (captures, jobs, plans, results, export, render, scenes, tasks, sessions, system):
+    for routes in (captures, uploads, jobs, plans, results, export, render, scenes, tasks, sessions, system):
         app.include_router(routes.router, dependencies=[Depends(authorize)])
     for routes in (sessions, system):
         app.include_router(routes.open_router)

@@ -18,6 +18,7 @@ from service.archives import Limits
 from service.keys import Keys
 from service.rendering import ModelCache, RenderPool
 from service.request_limits import RequestLimits
+from service.resumable import ResumableUploads
 from service.scenes import SceneFiles
 from service.settings import Settings
 
@@ -38,6 +39,7 @@ class Context:
     pool: RenderPool
     scenes: SceneFiles
     keys: Keys
+    resumable: ResumableUploads
     request_limits: RequestLimits
 
     @property
@@ -78,6 +80,7 @@ def open_context(settings: Settings) -> Context:
         pool=RenderPool(settings.images_at_once, settings.images_mb * MB),
         scenes=SceneFiles(),
         keys=Keys(store.root / "keys"),
+        resumable=ResumableUploads(store.root / "resumable"),
         request_limits=RequestLimits(settings.key_requests, settings.key_open_requests),
     )
 

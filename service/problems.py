@@ -100,6 +100,17 @@ class TooLarge(ServiceError):
     headers = MappingProxyType({"Connection": "close"})  # the rest of the body is not read
 
 
+class UploadNotFound(ServiceError):
+    """There is no such upload, or not one of the caller's."""
+
+    def __init__(self, upload_id: str) -> None:
+        super().__init__(f"There is no upload {upload_id}: it has expired, or never was. Begin one: POST /uploads.")
+
+
+class UploadConflict(ServiceError):
+    """A part that does not continue an upload, or a job of one that is not complete."""
+
+
 class NotYet(ServiceError):
     """A result that the job does not have yet."""
 
@@ -126,6 +137,8 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (BadRequest, 422, "bad-parameter"),
     (ArchiveError, 422, "capture-rejected"),
     (TooLarge, 413, "too-large"),
+    (UploadNotFound, 404, "no-such-upload"),
+    (UploadConflict, 409, "upload-conflict"),
     (NotYet, 404, "not-yet"),
     (Unauthorized, 401, "no-key"),
     (Forbidden, 403, "not-allowed"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import uuid
 from collections.abc import AsyncIterator
@@ -68,8 +69,10 @@ class Upload:
 
 
 @asynccontextmanager
-async def receive_capture(request: Request, uploads: Path, limits: Limits) -> AsyncIterator[Upload]:
-    """The capture in the body of a request, which is an archive or a multipart form with one.
+async def receive_capture(
+    request: Request, uploads: Path, limits: Limits, received: Path | None = None
+) -> AsyncIterator[Upload]:
+    """The capture in the body of a request, which is an archive or a multipart form with one, or in `received`.
 
     `folder` is removed with the context unless it was moved. Raises `ArchiveError` and `BadRequest`.
     """
@@ -78,7 +81,10 @@ async def receive_capture(request: Request, uploads: Path, limits: Limits) -> As
     name = uuid.uuid4().hex
     archive, folder = uploads / f"{name}.part", uploads / name
     try:
-        if request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
+        if received is not None:
+            os.link(received, archive)
+            config, digest = {}, await to_thread.run_sync(_digest, archive)
+        elif request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
             async with request.form(max_files=1, max_fields=1) as form:
                 config = _config_field(form)
                 digest = await _store(_chunks(_capture_field(form)), archive)
@@ -128,6 +134,11 @@ async def _store(chunks: AsyncIterator[bytes], archive: Path) -> str:
             digest.update(chunk)
             await file.write(chunk)
     return digest.hexdigest()
+
+
+def _digest(archive: Path) -> str:
+    with archive.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 async def _chunks(upload: UploadFile) -> AsyncIterator[bytes]:

@@ -15,12 +15,14 @@ from service.access import Caller, CallerDep
 from service.context import Context, ContextDep, JobId
 from service.inspection import inspect_capture
 from service.problems import RESPONSES, BadRequest
+from service.routes.uploads import owned
 from service.schemas import JobPage, JobResource, job_resource, job_summary
 from service.uploads import CAPTURE_BODY, parse_config, receive_capture, scene_capture
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], responses=RESPONSES)
 
 RETRY_AFTER_S = "2"
+_UPLOAD_ID = 32  # letters; a capture has 64
 
 # Without a body where `capture` names one that was sent before, or `scene` a synthetic one.
 OPTIONAL_BODY = {"requestBody": {**CAPTURE_BODY["requestBody"], "required": False}}
@@ -51,8 +53,8 @@ async def submit(
     capture: Annotated[
         str | None,
         Query(
-            pattern=r"^[0-9a-f]{64}$",
-            description="`capture` of one of your jobs, instead of a body: train on it again.",
+            pattern=r"^([0-9a-f]{64}|[0-9a-f]{32})$",
+            description="Instead of a body: `capture` of one of your jobs, or the `id` of a complete upload.",
         ),
     ] = None,
     scene: Annotated[
@@ -68,18 +70,25 @@ async def submit(
     if capture is not None and scene is not None:
         raise BadRequest("capture, scene: choose one of them.")
     webhook_address = None if webhook is None else str(webhook)
-    if capture is not None:
+    resumed = None
+    if capture is not None and len(capture) == _UPLOAD_ID:
+        resumed = await to_thread.run_sync(owned, context, caller, capture)
+        capture = resumed.capture
+    elif capture is not None:
         await to_thread.run_sync(_check_used, context, caller, capture)
+    if capture is not None:
         await inspect_capture(context.store.capture(capture), again.capture)
         spec = JobSpec(title, capture, again.model_dump(mode="json"), priority, caller.owner, webhook_address)
         return _accepted(await to_thread.run_sync(context.jobs.submit, spec, None, idempotency_key), response)
-    uploads = context.store.uploads
-    body = receive_capture(request, uploads, context.limits) if scene is None else scene_capture(scene, uploads)
-    async with body as upload:
+    uploads, archive = context.store.uploads, None if resumed is None else resumed.whole()
+    received = receive_capture(request, uploads, context.limits, archive)
+    async with received if scene is None else scene_capture(scene, uploads) as upload:
         chosen = make_config(preset, {**overrides, **upload.config})
         await inspect_capture(upload.folder, chosen.capture)
         spec = JobSpec(title, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
         job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder, idempotency_key)
+        if resumed is not None:
+            await to_thread.run_sync(resumed.write, upload.digest)
     return _accepted(job, response)
 
 
