@@ -3,9 +3,9 @@
     python benchmarks/fuzz.py [--count 10000] [--kinds images,json] [--seed 0] [--keep DIR] [--json FILE]
 
 Each input is made from a valid seed by its number, the kind and `--seed`, so one can be made again. It is read, or
-refused with an error class of ours that names the file, or a fault: another exception, the end of the process, more than
-3 GB or 20 CPU seconds, or a message with a path of the machine, a stack trace or the whole input. `--keep` writes the
-inputs of faults to a folder. The table is Markdown; the exit code is 1 if there was a fault.
+refused with an error class of ours that names the file, or a fault: another exception, the end of the process, more
+than 3 GB or 20 CPU seconds, or a message with a path of the machine, a stack trace, the whole input or letters that do
+not print. `--keep` writes the inputs of faults to a folder. The table is Markdown; the exit code is 1 after a fault.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def run_kind(kind: str, seed: str, count: int, temporary: str) -> tuple[Row, lis
             peak, slowest = max(peak, line["peak_mb"]), max(slowest, line["seconds"])
         if ending is not None:
             index = len(outcomes)
-            alone, again = _read_batch(kind, seed, index, index + 1, temporary)
+            _, again = _read_batch(kind, seed, index, index + 1, temporary)
             name = KINDS[kind].make(Random(f"{seed}/{kind}/{index}"))[0]
             place = again or f"alone it is read or refused; after others: {ending}"
             outcomes.append(Outcome(index=index, seed=name, error=ending, fault="the process ended", place=place))

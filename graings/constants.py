@@ -36,6 +36,9 @@ TILE: Final = 16
 # Longest side in px of any image that is read or rendered: a larger number is a typo or an attack on memory.
 MAX_IMAGE_SIDE: Final = 16384
 
+# A file of a few kilobytes can declare any size: images with more pixels are refused before they are decoded.
+MAX_IMAGE_PIXELS: Final = 2**26  # 1 GB as RGBA float32
+
 # SSIM as 3D Gaussian Splatting defines it, for values in [0, 1]: Gaussian window in pixels and the two stabilisers.
 SSIM_WINDOW: Final = 11
 SSIM_SIGMA: Final = 1.5

@@ -13,10 +13,28 @@ Each message names the file or field and a remedy. Misuse by a caller raises a p
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
+
+# Characters of a message: more only repeats what a file holds.
+MAX_MESSAGE: Final = 2_000
+
+
+def printable(text: str) -> str:
+    """`text` as a terminal and a log may show it, whatever file it came from.
+
+    What does not print, such as half of a surrogate pair or an escape sequence, is written as its number. Of a long
+    text the middle is left out.
+    """
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
+    return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE // 2]} … {text[-MAX_MESSAGE // 2 :]}"
 
 
 class GraingsError(Exception):
-    """Base class of all errors a user can encounter."""
+    """Base class of all errors a user can encounter. Its message is `printable`."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 class CaptureError(GraingsError):
@@ -27,12 +45,12 @@ class CaptureError(GraingsError):
     """
 
     def __init__(self, problem: str, *, file: Path | str, field: str | None = None, remedy: str) -> None:
-        self.problem = problem
-        self.file = str(file)
-        self.field = field
+        self.problem = printable(problem)
+        self.file = printable(str(file))
+        self.field = None if field is None else printable(field)
         self.remedy = remedy
-        where = self.file if field is None else f"{self.file}, {field}"
-        super().__init__(f"{where}: {problem}. {remedy}")
+        where = self.file if field is None else f"{self.file}, {self.field}"
+        super().__init__(f"{where}: {self.problem}. {remedy}")
 
 
 class ConfigError(GraingsError):

@@ -54,6 +54,14 @@ def image_format(name: str) -> ImageFormat:
     raise ValueError(f"image format {name!r} is not known, choose one of {', '.join(FORMATS)}")
 
 
+def library_problem(source: Any) -> str:
+    """The last error of `source`, an image of OpenImageIO or the library itself, in one line."""
+    try:
+        return " ".join(source.geterror().split())
+    except UnicodeDecodeError:  # it quotes the file, whose bytes need not be text
+        return "its header is damaged"
+
+
 def encode_image(
     color: ArrayLike,
     format: ImageFormat = "png",

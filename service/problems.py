@@ -21,7 +21,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.routing import Match, Mount
 
-from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError
+from graings.errors import CaptureError, CheckpointError, ConfigError, GraingsError, KernelError, printable
 from jobs.job import CaptureNotFound, JobConflict, JobDamaged, JobError, JobNotFound, OtherSubmission
 from jobs.task import TaskNotFound
 
@@ -51,9 +51,12 @@ class Problem(BaseModel):
 
 
 class ServiceError(Exception):
-    """Base class of the errors of the service itself."""
+    """Base class of the errors of the service itself. Its message is `printable`."""
 
     headers: Mapping[str, str] = MappingProxyType({})
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 class Unauthorized(ServiceError):

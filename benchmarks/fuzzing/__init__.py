@@ -1,1 +1,1 @@
-"""Hostile input for the readers: seeds, mutations, and the bounded process that reads them. Run by benchmarks/fuzz.py."""
+"""Hostile input for the readers: seeds, mutations, and the process that reads them (benchmarks/fuzz.py)."""

@@ -33,7 +33,9 @@ def name_of(rng: Random) -> str:
 
 
 def content_of(rng: Random) -> bytes:
-    return rng.choice((b"{}", b"", rng.randbytes(300), b"\0" * 100_000, b"\0" * 3_000_000 if rng.random() < 0.1 else b"x"))
+    return rng.choice(
+        (b"{}", b"", rng.randbytes(300), b"\0" * 100_000, b"\0" * 3_000_000 if rng.random() < 0.1 else b"x")
+    )
 
 
 def zipped(rng: Random) -> bytes:
@@ -76,7 +78,22 @@ def lying_zip(data: bytes, rng: Random) -> bytes:
 
 def tarred(rng: Random) -> bytes:
     """A tar with links, devices, sparse files and extended headers."""
-    kinds = (tarfile.REGTYPE,) * 6 + (b"\0", b"1", b"2", b"3", b"4", b"5", b"6", b"7", b"L", b"K", b"x", b"g", b"S", b"X")
+    kinds = (tarfile.REGTYPE,) * 6 + (
+        b"\0",
+        b"1",
+        b"2",
+        b"3",
+        b"4",
+        b"5",
+        b"6",
+        b"7",
+        b"L",
+        b"K",
+        b"x",
+        b"g",
+        b"S",
+        b"X",
+    )
     target = io.BytesIO()
     format = rng.choice((tarfile.GNU_FORMAT, tarfile.PAX_FORMAT, tarfile.USTAR_FORMAT))
     with tarfile.open(fileobj=target, mode="w", format=format, errors="surrogateescape") as archive:
@@ -86,7 +103,9 @@ def tarred(rng: Random) -> bytes:
             info.type, content = rng.choice(kinds), content_of(rng)
             info.linkname, info.size = rng.choice(("", "/etc/passwd", "../x", "x.json")), len(content)
             if format == tarfile.PAX_FORMAT and rng.random() < 0.3:
-                key = rng.choice(("size", "path", "linkpath", "mtime", "GNU.sparse.major", "GNU.sparse.map", "hdrcharset"))
+                key = rng.choice(
+                    ("size", "path", "linkpath", "mtime", "GNU.sparse.major", "GNU.sparse.map", "hdrcharset")
+                )
                 value = rng.choice((*TEXTS[:16], *map(str, WIDE), "1,2", "BINARY"))
                 info.pax_headers = {key: value.encode("utf-8", "replace").decode()}
             try:
@@ -167,7 +186,9 @@ def read(inner: Path, name: str, data: bytes) -> None:
             raise Damage("a refused archive left files") from None
         raise
     finally:
-        if {path.name for path in inner.iterdir()} - {"archive", "out"} or [p.name for p in inner.parent.iterdir()] != ["inner"]:
+        if {path.name for path in inner.iterdir()} - {"archive", "out"} or [p.name for p in inner.parent.iterdir()] != [
+            "inner"
+        ]:
             raise Damage("a file outside of the folder")
     files = [path for path in out.rglob("*") if not path.is_dir() or path.is_symlink()]
     plain = all(path.is_file() and not path.is_symlink() for path in files)

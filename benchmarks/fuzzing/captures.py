@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from fuzzing import images
+from fuzzing.archives import Damage
 from fuzzing.mutations import NUMBERS, WIDE, mutated, mutated_json
 from graings.camera.camera import Camera
 from graings.capture.images import ImageStore
@@ -23,9 +24,7 @@ PINHOLE = (30.0, 31.0, 12.0, 8.0)
 
 
 def cameras() -> list[Camera]:
-    return [
-        Camera.orbit(360.0 * i / COUNT, 20.0, 4.0, fov=0.7, width=SIZE[0], height=SIZE[1]) for i in range(COUNT)
-    ]
+    return [Camera.orbit(360.0 * i / COUNT, 20.0, 4.0, fov=0.7, width=SIZE[0], height=SIZE[1]) for i in range(COUNT)]
 
 
 def opengl(camera: Camera) -> list[list[float]]:
@@ -88,22 +87,24 @@ def colmap_files(text: bool) -> dict[str, bytes]:
     poses = [(1.0, 0.0, 0.0, 0.0, float(i), 0.0, 4.0) for i in range(COUNT)]
     points = np.random.default_rng(0).normal(size=(5, 3))
     if text:
-        lines = (f"{i + 1} {' '.join(map(str, p))} 1 {n}\n1.0 2.0 -1\n" for i, (p, n) in enumerate(zip(poses, names, strict=True)))
+        posed = enumerate(zip(poses, names, strict=True), start=1)
+        listed = "".join(f"{i} {' '.join(map(str, p))} 1 {n}\n1.0 2.0 -1\n" for i, (p, n) in posed)
+        cloud = "".join(f"{i} {x} {y} {z} 255 9 0 0.5 1 0\n" for i, (x, y, z) in enumerate(points))
         return {
             "cameras.txt": b"# Number of cameras: 1\n1 PINHOLE 24 16 30 31 12 8\n",
-            "images.txt": f"# Number of images: {COUNT}\n{''.join(lines)}".encode(),
-            "points3D.txt": "".join(f"{i} {x} {y} {z} 255 9 0 0.5 1 0\n" for i, (x, y, z) in enumerate(points)).encode(),
+            "images.txt": f"# Number of images: {COUNT}\n{listed}".encode(),
+            "points3D.txt": cloud.encode(),
         }
-    head = struct.pack("<QIiQQ4d", 1, 1, 1, *SIZE, *PINHOLE)
-    listed = b"".join(
+    camera = struct.pack("<QIiQQ4d", 1, 1, 1, *SIZE, *PINHOLE)
+    registered = b"".join(
         struct.pack("<I7dI", i + 1, *pose, 1) + name.encode() + b"\0" + struct.pack("<Q2dq", 1, 1.0, 2.0, -1)
         for i, (pose, name) in enumerate(zip(poses, names, strict=True))
     )
-    cloud = b"".join(struct.pack("<Q3d3BdQ2i", i, *row, 255, 9, 0, 0.5, 1, 1, 0) for i, row in enumerate(points))
+    tracks = b"".join(struct.pack("<Q3d3BdQ2i", i, *row, 255, 9, 0, 0.5, 1, 1, 0) for i, row in enumerate(points))
     return {
-        "cameras.bin": head,
-        "images.bin": struct.pack("<Q", COUNT) + listed,
-        "points3D.bin": struct.pack("<Q", len(points)) + cloud,
+        "cameras.bin": camera,
+        "images.bin": struct.pack("<Q", COUNT) + registered,
+        "points3D.bin": struct.pack("<Q", len(points)) + tracks,
     }
 
 
@@ -115,7 +116,10 @@ def layouts() -> dict[str, dict[str, bytes]]:
         found[name] = {f"sparse/0/{file}": content for file, content in colmap_files(text).items()}
     found["colmap"]["times.json"] = {f"{i:03d}.png": i / COUNT for i in range(COUNT)}
     return {
-        layout: {name: content if isinstance(content, bytes) else json.dumps(content).encode() for name, content in files.items()}
+        layout: {
+            name: content if isinstance(content, bytes) else json.dumps(content).encode()
+            for name, content in files.items()
+        }
         for layout, files in found.items()
     }
 
@@ -200,6 +204,9 @@ def read(folder: Path, name: str, data: bytes) -> None:
     try:
         capture = load_capture(folder / layout)
         ImageStore((1.0, 1.0, 1.0)).rgb(capture.train[0])
+        notes = "\n".join(capture.notes)
+        if not notes.replace("\n", "").isprintable() or len(notes) > 10_000:
+            raise Damage("notes that cannot be printed")
     finally:
         path.write_bytes(layouts()[layout][file])
 
@@ -217,5 +224,3 @@ def given(folder: Path, name: str) -> Path:
 def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
-
-

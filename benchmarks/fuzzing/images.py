@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import tempfile
 import zlib
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -13,13 +14,19 @@ import numpy as np
 import OpenImageIO as oiio
 
 from fuzzing.mutations import WIDE, mutated
-from graings.capture.image_file import check_image, decode
+from graings.capture.image_file import PNG_SIGNATURE, check_image, decode
+from graings.footage.photos import SUFFIXES, convert_photographs
 
 # Suffix, channels, type and compression.
 KINDS = (
     *(("png", 4, "uint8", ""), ("png", 3, "uint16", ""), ("png", 1, "uint8", ""), ("jpg", 3, "uint8", "")),
     *(("exr", 4, "half", "zip"), ("exr", 3, "float", "piz"), ("exr", 3, "half", "none"), ("exr", 3, "half", "dwaa")),
-    *(("tif", 4, "uint8", "lzw"), ("tif", 3, "uint16", "zip"), ("tif", 3, "float", "none"), ("tif", 3, "uint8", "jpeg")),
+    *(
+        ("tif", 4, "uint8", "lzw"),
+        ("tif", 3, "uint16", "zip"),
+        ("tif", 3, "float", "none"),
+        ("tif", 3, "uint8", "jpeg"),
+    ),
     *(("webp", 4, "uint8", ""), ("bmp", 3, "uint8", ""), ("gif", 3, "uint8", ""), ("tga", 4, "uint8", "rle")),
 )
 
@@ -51,6 +58,20 @@ def png_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
     return chunks
 
 
+@cache
+def bomb(side: int) -> bytes:
+    """A PNG of a few hundred kilobytes with side x side transparent pixels."""
+    rows = zlib.compressobj(9)
+    parts = [rows.compress(bytes(4 * side + 1)) for _ in range(side)] + [rows.flush()]
+    header = struct.pack(">2I5B", side, side, 8, 6, 0, 0, 0)
+    return _png(((b"IHDR", header), (b"IDAT", b"".join(parts)), (b"IEND", b"")))
+
+
+def _png(chunks: Sequence[tuple[bytes, bytes]]) -> bytes:
+    parts = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks]
+    return PNG_SIGNATURE + b"".join(parts)
+
+
 def lying_png(data: bytes, rng: Random) -> bytes:
     """Chunks with other contents, in another order, or bombs, all with the right check sums."""
     chunks = png_chunks(data)
@@ -58,8 +79,6 @@ def lying_png(data: bytes, rng: Random) -> bytes:
     kind, content = chunks[place]
     action = rng.randrange(6)
     if action == 0:
-        header = bytearray(chunks[0][1])
-        header[rng.choice((0, 4)) :][:4] = b""
         size = (rng.choice(WIDE) % (1 << 32)).to_bytes(4, "big")
         offset = rng.choice((0, 4))
         header = bytearray(chunks[0][1])
@@ -78,9 +97,10 @@ def lying_png(data: bytes, rng: Random) -> bytes:
     elif action == 4:
         rng.shuffle(chunks)
     else:
-        chunks.insert(place, (rng.choice((b"PLTE", b"tRNS", b"eXIf", b"acTL", b"sRGB", b"gAMA", kind)), rng.randbytes(30)))
-    parts = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks]
-    return data[:8] + b"".join(parts)
+        chunks.insert(
+            place, (rng.choice((b"PLTE", b"tRNS", b"eXIf", b"acTL", b"sRGB", b"gAMA", kind)), rng.randbytes(30))
+        )
+    return _png(chunks)
 
 
 def lying_jpeg(data: bytes, rng: Random) -> bytes:
@@ -94,8 +114,23 @@ def lying_jpeg(data: bytes, rng: Random) -> bytes:
     return bytes(changed)
 
 
+def photographs() -> tuple[tuple[str, bytes], ...]:
+    """The seeds that footage may have."""
+    return tuple((name, data) for name, data in seeds() if Path(name).suffix in SUFFIXES)
+
+
 def make(rng: Random) -> tuple[str, bytes]:
-    name, data = rng.choice(seeds())
+    return _made(rng, seeds())
+
+
+def make_photograph(rng: Random) -> tuple[str, bytes]:
+    return _made(rng, photographs())
+
+
+def _made(rng: Random, some: tuple[tuple[str, bytes], ...]) -> tuple[str, bytes]:
+    name, data = rng.choice(some)
+    if rng.random() < 0.002:
+        return "bomb.png", bomb(rng.choice((4_000, 8_192, 12_000)))
     if name.endswith("png") and rng.random() < 0.7:
         return name, lying_png(data, rng)
     if name.endswith("jpg") and rng.random() < 0.4:
@@ -108,3 +143,10 @@ def read(folder: Path, name: str, data: bytes) -> None:
     path.write_bytes(data)
     image = check_image(path, name, data)
     decode(path, name, image.orientation)
+
+
+def read_photograph(folder: Path, name: str, data: bytes) -> None:
+    """As a photograph of footage, from which a capture is made."""
+    path = folder / name
+    path.write_bytes(data)
+    convert_photographs([path], folder, 32, lambda done, count: None)

@@ -13,8 +13,9 @@ from fuzzing import archives, captures, images, models
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """`valid` are the seeds, all of which are read; `make` gives the name and content of an input; `open` prepares a folder, and `read` reads an input there.
+    """`valid` are the seeds, which are read; `make` gives name and content of an input.
 
+    `open` prepares a folder, and `read` reads an input in it.
     A message must have one of the names in `named`, and may have the path `given` to the reader but no other.
     """
 
@@ -50,6 +51,7 @@ KINDS = {
     for kind in (
         Kind("archives", archives.valid, archives.make, archives.read, archives.open_folder, _anything),
         Kind("images", images.seeds, images.make, images.read),
+        Kind("photographs", images.photographs, images.make_photograph, images.read_photograph),
         _capture("json", captures.make_json, ".json"),
         _capture("arrays", captures.make_arrays, ".npy"),
         _capture("colmap", captures.make_colmap, ".bin", ".txt"),

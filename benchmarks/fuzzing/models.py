@@ -47,9 +47,7 @@ def model() -> Model:
     rate = SamplingRate(extent=1.0, reference=10.0, coarsest=10.0)
     scene = Scene(config, scaffold, extent=1.0, sampling=rate, initial_opacity=0.3)
     scene.temporal = True
-    views = [
-        View(f"v{i}", Camera.orbit(60.0 * i, 20.0, 2.5, fov=0.9, width=16, height=16), i / 5) for i in range(6)
-    ]
+    views = [View(f"v{i}", Camera.orbit(60.0 * i, 20.0, 2.5, fov=0.9, width=16, height=16), i / 5) for i in range(6)]
     parts = {"train": tuple(views[1:]), "val": (views[0],)}
     units = Units((0.0, 0.0, 0.0), 0.5, time_span=2.0)
     return Model(scene, units, WHITE, parts, make_config(), 7, True, "0" * 64, Path("seed"))
@@ -191,7 +189,20 @@ def make_ply(rng: Random) -> tuple[str, bytes]:
     if rng.random() < 0.5:  # a word of the header
         head, end, body = data.partition(b"end_header")
         words = head.split(b" ")
-        strange = (*NUMBERS, "", "list", "vertex", "x", "float128", "ascii", "element", "property", "\n", "x" * 9_000, "\xff")
+        strange = (
+            *NUMBERS,
+            "",
+            "list",
+            "vertex",
+            "x",
+            "float128",
+            "ascii",
+            "element",
+            "property",
+            "\n",
+            "x" * 9_000,
+            "\xff",
+        )
         words[rng.randrange(len(words))] = rng.choice(strange).encode("latin-1", "replace")
         return name, b" ".join(words) + end + body
     return name, mutated(data, rng, others)

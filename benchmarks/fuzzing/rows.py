@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Outcome(BaseModel):
-    """What became of one input. `error` is the class of what was raised, `fault` what is wrong with that, if anything."""
+    """What became of one input: `error` is the class of what was raised, `fault` what is wrong with that."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -51,15 +51,15 @@ class Row(BaseModel):
 def table(rows: list[Row]) -> str:
     """The rows as Markdown."""
     lines = [
-        "| kind | inputs | read | refused | faults | greatest memory, MB | slowest input, s |",
+        "| kind | inputs | read | refused | faults | greatest memory, MB | slowest input, CPU s |",
         "|---|---:|---:|---:|---:|---:|---:|",
     ]
-    for row in rows:
-        lines.append(
-            f"| {row.kind} | {row.inputs:,} | {row.read:,} | {row.refused:,} | {row.faults:,} | {row.peak_mb:,} | "
-            f"{row.slowest_s:.2f} |"
-        )
-    return "\n".join(lines)
+    return "\n".join([*lines, *map(_line, rows)])
+
+
+def _line(row: Row) -> str:
+    outcomes = f"{row.inputs:,} | {row.read:,} | {row.refused:,} | {row.faults:,}"
+    return f"| {row.kind} | {outcomes} | {row.peak_mb:,} | {row.slowest_s:.2f} |"
 
 
 def distinct(outcomes: list[Outcome]) -> list[tuple[Outcome, int]]:

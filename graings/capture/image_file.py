@@ -15,16 +15,14 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from graings.constants import MAX_IMAGE_SIDE
+from graings.constants import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE
 from graings.errors import CaptureError
+from graings.image_encoding import library_problem
 
 # Suffixes that a listed name may lack or have instead of another, in the order in which they are tried.
 SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".exr", ".jfif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".tga")
 # Pictures that are not read. They are looked for as well, so that the message can say why.
 UNREADABLE_SUFFIXES: Final = (".heic", ".heif", ".avif", ".dng", ".hdr")
-
-# A PNG of a few kilobytes can declare any size: larger images are refused before they are decoded.
-MAX_PIXELS: Final = 2**26  # 1 GB as RGBA float32
 
 PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE: Final = b"\xff\xd8\xff"
@@ -101,11 +99,11 @@ def decode(path: Path, name: str, orientation: int = 1) -> NDArray[np.float32]:
     spec = source.spec()
     color, alpha = _channels(spec, name)
     stored = source.read_image(0, 0, 0, spec.nchannels, spec.format)
-    problem = source.geterror()
+    problem = library_problem(source)
     straight = spec.get_int_attribute("oiio:UnassociatedAlpha") == 1  # PNG and WebP; EXR is premultiplied, TIFF either
     source.close()
     if stored is None or problem:
-        raise _damaged(name, f"cannot be decoded ({' '.join(problem.split())})")
+        raise _damaged(name, f"cannot be decoded ({problem})")
     stored = np.asarray(stored).reshape(spec.height, spec.width, spec.nchannels)
     pixels = stored[..., color if alpha is None else [*color, alpha]].astype(np.float32)
     if np.issubdtype(stored.dtype, np.integer):
@@ -136,11 +134,11 @@ def _open(path: Path, name: str) -> oiio.ImageInput:
     options["oiio:UnassociatedAlpha"] = 1
     source = oiio.ImageInput.open(str(path), options)
     if source is None:
-        raise _damaged(name, f"cannot be opened ({' '.join(oiio.geterror().split())})")
+        raise _damaged(name, f"cannot be opened ({library_problem(oiio)})")
     spec = source.spec()
-    if max(spec.width, spec.height) > MAX_IMAGE_SIDE or spec.width * spec.height > MAX_PIXELS:
+    if max(spec.width, spec.height) > MAX_IMAGE_SIDE or spec.width * spec.height > MAX_IMAGE_PIXELS:
         raise CaptureError(
-            f"is {spec.width}x{spec.height} px, more than {MAX_IMAGE_SIDE} px per side or {MAX_PIXELS} px in total",
+            f"is {spec.width}x{spec.height} px, more than {MAX_IMAGE_SIDE} px per side or {MAX_IMAGE_PIXELS} in total",
             file=name,
             field="size",
             remedy="Scale the images down.",

@@ -17,7 +17,7 @@ from graings.camera.camera import Camera
 from graings.camera.units import Units
 from graings.capture.capture import ALL_SPLITS, Capture, Frame, Kind, PointCloud
 from graings.capture.raw_capture import MAX_MAGNITUDE, RawCapture, RawFrame
-from graings.errors import CaptureError
+from graings.errors import CaptureError, printable
 
 Array = NDArray[np.float64]
 
@@ -122,7 +122,7 @@ def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash
         units=units,
         has_alpha=any(raw_frame.image.has_alpha for raw_frame in raw_frames),
         points=points,
-        notes=tuple(notes),
+        notes=tuple(map(printable, notes)),
         content_hash=content_hash,
     )
 

@@ -70,7 +70,8 @@ def splats_from_ply(name: str, data: bytes) -> tuple[Splats, Units]:
         raise CheckpointError(f"{name}: has no {', '.join(missing)}, so its vertices are no splats. {_REMEDY}")
     rest = sum(column.startswith("f_rest_") for column in names)
     degree = math.isqrt(rest // 3 + 1) - 1
-    if rest != 3 * degree * (degree + 2) or degree > MAX_DEGREE:
+    complete = {f"f_rest_{index}" for index in range(rest)} <= names
+    if rest != 3 * degree * (degree + 2) or degree > MAX_DEGREE or not complete:
         raise CheckpointError(f"{name}: has {rest} columns f_rest; 0, 9, 24 or 45 can be drawn. {_REMEDY}")
     if len(rows) == 0:
         raise CheckpointError(f"{name}: holds no splats. {_REMEDY}")

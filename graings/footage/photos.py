@@ -10,10 +10,11 @@ from typing import Final
 import numpy as np
 import OpenImageIO as oiio
 
+from graings.constants import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE
 from graings.errors import CaptureError
 from graings.footage.frame_document import FootageFrame
 from graings.footage.sharpness import WIDTH, sharpness
-from graings.image_encoding import encode_image
+from graings.image_encoding import encode_image, library_problem
 from graings.storage.files import write_bytes
 
 SUFFIXES: Final = {".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".bmp"}
@@ -55,9 +56,15 @@ def convert_photographs(
 def _read(photo: Path, max_side: int) -> tuple[oiio.ImageBuf, float | None]:
     """The upright image at its final size, and its EXIF time in seconds."""
     image = oiio.ImageBuf(str(photo))
+    size = image.spec()
+    if max(size.width, size.height) > MAX_IMAGE_SIDE or size.width * size.height > MAX_IMAGE_PIXELS:
+        problem = f"is {size.width}x{size.height} px, more than {MAX_IMAGE_PIXELS} px in total"
+        raise CaptureError(problem, file=photo, remedy="Scale it down, or remove it.")
     if not image.read(convert=oiio.FLOAT):
         remedy = "Convert it to JPEG or PNG, or remove it."
-        raise CaptureError(f"cannot be read as an image ({image.geterror()})", file=photo, remedy=remedy)
+        raise CaptureError(f"cannot be read as an image ({library_problem(image)})", file=photo, remedy=remedy)
+    if not np.isfinite(np.asarray(image.get_pixels(oiio.FLOAT))).all():
+        raise CaptureError("holds values that are not finite", file=photo, remedy="Export it again, or remove it.")
     time = _time(image.spec())
     image = oiio.ImageBufAlgo.reorient(image)
     spec = image.spec()

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -29,7 +28,7 @@ from graings.config import TrainConfig
 from graings.errors import CheckpointError
 from graings.scene.scene import Scene
 from graings.storage.files import sync_folder, sync_tree
-from graings.storage.model import Model, model_facts, model_from
+from graings.storage.model import DAMAGE, Model, model_facts, model_from
 from graings.storage.run_folder import BEST, CHECKPOINTS, FACTS_FILE, checkpoints
 from graings.storage.run_folder import best_checkpoint as best_checkpoint  # part of this module's interface too
 from graings.storage.run_folder import newest_checkpoint as newest_checkpoint
@@ -137,7 +136,7 @@ def load_state(folder: Path) -> TrainingState:
     """What the trainer stored in a checkpoint folder. Raises `CheckpointError`."""
     try:
         return TrainingState(load_file(folder / _STATE_FILE), _read_facts(folder)["state"])
-    except (OSError, SafetensorError, KeyError) as error:
+    except (OSError, SafetensorError, *DAMAGE) as error:
         raise CheckpointError(
             f"{folder}: damaged training state ({error!r}). Remove this folder; {_REMEDY}."
         ) from error
@@ -147,7 +146,7 @@ def _model(folder: Path) -> Model:
     facts = _read_facts(folder)
     try:
         return model_from(facts, load_file(folder / _SCENE_FILE), facts["digest"], folder)
-    except (OSError, SafetensorError, ValidationError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (OSError, SafetensorError, *DAMAGE) as error:
         raise CheckpointError(f"{folder}: damaged checkpoint ({error!r}). Remove this folder; {_REMEDY}.") from error
 
 
@@ -173,7 +172,7 @@ def _newest_readable(path: Path, read: Callable[[Path], Read]) -> Read:
 def _read_facts(folder: Path) -> dict[str, Any]:
     try:
         facts = json.loads((folder / FACTS_FILE).read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(
             f"{folder / FACTS_FILE}: not readable ({error}). Remove this folder; {_REMEDY}."
         ) from error
@@ -191,7 +190,7 @@ def intact(checkpoint: Path) -> Iterator[None]:
     """Raise `CheckpointError` about `checkpoint` where its contents do not fit."""
     try:
         yield
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
+    except DAMAGE as error:
         raise CheckpointError(
             f"{checkpoint}: damaged training state ({error!r}). Remove it to continue from an earlier one."
         ) from error

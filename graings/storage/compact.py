@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import io
 import json
 import zlib
 from pathlib import Path
@@ -26,13 +27,17 @@ from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.storage.checkpoint import load_model
 from graings.storage.files import write_bytes
-from graings.storage.model import Model, model_facts, model_from
+from graings.storage.model import DAMAGE, Model, model_facts, model_from
 from graings.storage.run_folder import newest_model
 
 FORMAT: Final = "graings.model/1"
 SUFFIX: Final = ".graings"
 
 _FACTS: Final = "graings"
+
+# A model unpacks to one and a half times its size. Up to so many bytes any ratio is harmless.
+_MAX_RATIO: Final = 20
+_ANY_SIZE: Final = 64 << 20
 
 # Rows of the scaffold for which float16 is enough.
 _HALVED: Final = ("features", "opacity_offsets")
@@ -82,7 +87,7 @@ def read_compact(path: Path) -> Model:
     """The model in the file `path`, in float32. Raises `CheckpointError`."""
     try:
         packed = path.read_bytes()
-        data = gzip.decompress(packed)
+        data = _unpacked(packed)
         size = int.from_bytes(data[:8], "little")
         facts = json.loads(json.loads(data[8 : 8 + size])["__metadata__"][_FACTS])
         if facts["format"] != FORMAT:
@@ -91,8 +96,18 @@ def read_compact(path: Path) -> Model:
         tensors = {name: tensor.float() for name, tensor in tensors.items()}
         tensors["scaffold.uids"] = torch.arange(len(tensors["scaffold.anchors"]))
         return model_from(facts, tensors, hashlib.sha256(packed).hexdigest(), path)
-    except (OSError, EOFError, zlib.error, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (OSError, EOFError, zlib.error, SafetensorError, *DAMAGE) as error:
         raise CheckpointError(f"{path}: no model, or a damaged one ({error}). Export it again.") from error
+
+
+def _unpacked(packed: bytes) -> bytes:
+    """The content of a gzip file. Raises `ValueError` for one that would fill the memory."""
+    most = max(_ANY_SIZE, _MAX_RATIO * len(packed))
+    with gzip.open(io.BytesIO(packed)) as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise ValueError(f"it unpacks to more than {_MAX_RATIO} times its size")
+    return data
 
 
 def open_model(path: Path) -> Model:

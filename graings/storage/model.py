@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from torch import Tensor
@@ -16,6 +16,9 @@ from graings.camera.units import Units
 from graings.config import SceneConfig, TrainConfig, restored
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
+
+# What Python, pydantic and torch raise where facts or tensors are not what they should be.
+DAMAGE: Final = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RuntimeError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +68,7 @@ def model_facts(
 def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: str, path: Path) -> Model:
     """The model of `model_facts` and the tensors of its scene, as read from `path`.
 
-    Raises `CheckpointError` for options that do not fit, and `KeyError`, `TypeError` or `ValueError` for damaged facts.
+    Raises `CheckpointError` for options that do not fit, and one of `DAMAGE` for damaged facts.
     """
     config = restored(TrainConfig, facts["config"], path)
     shape = restored(SceneConfig, facts["scene_config"], path)

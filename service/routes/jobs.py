@@ -77,6 +77,8 @@ async def submit(
     elif capture is not None:
         await to_thread.run_sync(_check_used, context, caller, capture)
     if capture is not None:
+        if not context.store.capture(capture).is_dir():
+            raise CaptureNotFound(capture)
         await inspect_capture(context.store.capture(capture), again.capture)
         spec = JobSpec(title, capture, again.model_dump(mode="json"), priority, caller.owner, webhook_address)
         return _accepted(await to_thread.run_sync(context.jobs.submit, spec, None, idempotency_key), response)
