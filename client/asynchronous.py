@@ -15,7 +15,7 @@ import httpx2
 
 from client import calls
 from client.answers import ClientError, Event, RemoteJob
-from client.captures import Observe, chunks, packed
+from client.captures import Observe, packed, uploading
 
 T = TypeVar("T")
 
@@ -51,10 +51,31 @@ class AsyncClient:
         `webhook` is an address that is told what happens; `webhook_secret` in the document of the answer verifies its
         messages.
         """
-        call = calls.submit(name or Path(capture).stem, preset, config, priority, webhook, uuid.uuid4().hex)
+        upload_id = await self.upload(capture, observe)
+        named = name or Path(capture).stem
+        return await self._do(calls.submit(upload_id, named, preset, config, priority, webhook, uuid.uuid4().hex))
+
+    async def upload(self, capture: Path | str, observe: Observe | None = None) -> str:
+        """Send a capture and return the id of its upload, of which a job can be made for a day.
+
+        A connection that breaks, or a service that restarts, is continued where it broke.
+        """
         with ExitStack() as stack:
             archive = await asyncio.to_thread(stack.enter_context, packed(capture))
-            return await self._do(call, chunks(archive, observe))
+            steps = uploading(archive, observe)
+            step = next(steps)
+            while True:
+                call, content, pause = step
+                await asyncio.sleep(pause)
+                try:
+                    answer = await self._do(call, content)
+                except ClientError as error:
+                    step = steps.throw(error)
+                    continue
+                try:
+                    step = steps.send(answer)
+                except StopIteration as end:
+                    return str(end.value)
 
     async def submit_scene(
         self, scene: str, *, preset: str = "standard", config: calls.Query | None = None

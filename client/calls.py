@@ -66,12 +66,32 @@ def no_answer(url: httpx2.URL, error: Exception) -> str:
 
 
 def submit(
-    name: str, preset: str, config: Query | None, priority: int, webhook: str | None, key: str
+    upload_id: str, name: str, preset: str, config: Query | None, priority: int, webhook: str | None, key: str
 ) -> Call[RemoteJob]:
-    query = {"name": name, "preset": preset, "priority": priority, "config": json.dumps(dict(config or {}))}
+    query = {
+        "capture": upload_id,
+        "name": name,
+        "preset": preset,
+        "priority": priority,
+        "config": json.dumps(dict(config or {})),
+    }
     query |= {} if webhook is None else {"webhook": webhook}
-    headers = {"Content-Type": "application/octet-stream", "Idempotency-Key": key}
-    return Call("POST", "/jobs", _job, query, headers)
+    return Call("POST", "/jobs", _job, query, {"Idempotency-Key": key})
+
+
+def begin_upload(size: int) -> Call[dict[str, Any]]:
+    return Call("POST", "/uploads", _json, {"bytes": size})
+
+
+def send_part(upload_id: str, start: int, end: int, size: int) -> Call[dict[str, Any]]:
+    """The bytes from `start` to `end` of an archive."""
+    length, part = str(end - start), f"bytes {start}-{end - 1}/{size}"
+    headers = {"Content-Type": "application/octet-stream", "Content-Length": length, "Content-Range": part}
+    return Call("PUT", f"/uploads/{upload_id}", _json, headers=headers)
+
+
+def upload_state(upload_id: str) -> Call[dict[str, Any]]:
+    return Call("GET", f"/uploads/{upload_id}", _json)
 
 
 def submit_scene(scene: str, preset: str, config: Query | None, key: str) -> Call[RemoteJob]:

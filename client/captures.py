@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import tempfile
+import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from client.answers import ClientError
+from client import calls
+from client.answers import ClientError, RefusedError
 
 CHUNK = 1 << 20
+# Bytes of one request: a proxy may keep a body back until it is complete, and loses it when the connection breaks.
+PART = 16 << 20
+# The connection broke, or another request that it belonged to is still open, or the service is busy.
+RETRIED = (400, 408, 409, 429, 502, 503, 504)
 
 Observe = Callable[[int, int], None]
+Step = tuple[calls.Call[dict[str, Any]], Iterator[bytes] | None, float]
 
 
 @contextmanager
@@ -33,12 +41,41 @@ def packed(capture: Path | str) -> Iterator[Path]:
         yield target
 
 
-def chunks(archive: Path, observe: Observe | None, start: int = 0) -> Iterator[bytes]:
-    """The content from byte `start` on. `observe` gets the number of bytes taken, and of all."""
+def chunks(archive: Path, observe: Observe | None, start: int, end: int) -> Iterator[bytes]:
+    """The content from byte `start` to `end`. `observe` gets the number of bytes taken so far, and of all."""
     total = archive.stat().st_size
     with archive.open("rb") as file:
         file.seek(start)
-        while chunk := file.read(CHUNK):
+        while chunk := file.read(min(CHUNK, end - file.tell())):
             yield chunk
             if observe is not None:
                 observe(file.tell(), total)
+
+
+def uploading(archive: Path, observe: Observe | None) -> Generator[Step, dict[str, Any], str]:
+    """The requests that bring an archive to the service, and at last the id of the upload.
+
+    Each step is a request with its body and a pause before it; the answer is sent back, or a `ClientError` thrown in.
+    After an interruption the service is asked how far it came, for `calls.PATIENCE_S` without any progress.
+    """
+    size = archive.stat().st_size
+    state = yield calls.begin_upload(size), None, 0.0
+    received, heard, broken = 0, time.monotonic(), False
+    while broken or received < size:
+        end = min(size, received + PART)
+        try:
+            if broken:
+                state = yield calls.upload_state(state["id"]), None, calls.RECONNECT_S
+            else:
+                part = calls.send_part(state["id"], received, end, size)
+                state = yield part, chunks(archive, observe, received, end), 0.0
+            broken = False
+        except ClientError as error:
+            refused = isinstance(error, RefusedError) and error.status not in RETRIED
+            if refused or time.monotonic() - heard > calls.PATIENCE_S:
+                raise
+            broken = True
+        if state["received"] > received:
+            received, heard = state["received"], time.monotonic()
+    upload_id: str = state["id"]
+    return upload_id

@@ -129,7 +129,7 @@ def make_photograph(rng: Random) -> tuple[str, bytes]:
 
 def _made(rng: Random, some: tuple[tuple[str, bytes], ...]) -> tuple[str, bytes]:
     name, data = rng.choice(some)
-    if rng.random() < 0.002:
+    if rng.random() < 0.0005:
         return "bomb.png", bomb(rng.choice((4_000, 8_192, 12_000)))
     if name.endswith("png") and rng.random() < 0.7:
         return name, lying_png(data, rng)

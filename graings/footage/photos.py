@@ -38,6 +38,8 @@ def convert_photographs(
     for index, photo in enumerate(photos):
         image, time = _read(photo, max_side)
         pixels = np.asarray(image.get_pixels(oiio.FLOAT))
+        if not np.isfinite(pixels).all():
+            raise CaptureError("holds values that are not finite", file=photo, remedy="Export it again, or remove it.")
         rgb = np.repeat(pixels[..., :1], 3, axis=2) if pixels.shape[2] < 3 else pixels[..., :3]
         luma = (rgb @ np.array([0.299, 0.587, 0.114], np.float32) * 255).clip(0, 255).astype(np.uint8)
         step = max(1, luma.shape[1] // WIDTH)
@@ -63,16 +65,12 @@ def _read(photo: Path, max_side: int) -> tuple[oiio.ImageBuf, float | None]:
     if not image.read(convert=oiio.FLOAT):
         remedy = "Convert it to JPEG or PNG, or remove it."
         raise CaptureError(f"cannot be read as an image ({library_problem(image)})", file=photo, remedy=remedy)
-    if not np.isfinite(np.asarray(image.get_pixels(oiio.FLOAT))).all():
-        raise CaptureError("holds values that are not finite", file=photo, remedy="Export it again, or remove it.")
-    time = _time(image.spec())
-    image = oiio.ImageBufAlgo.reorient(image)
-    spec = image.spec()
-    scale = max_side / max(spec.width, spec.height)
+    time = _time(size)
+    scale = max_side / max(size.width, size.height)
     if scale < 1:
-        roi = oiio.ROI(0, max(1, round(spec.width * scale)), 0, max(1, round(spec.height * scale)))
+        roi = oiio.ROI(0, max(1, round(size.width * scale)), 0, max(1, round(size.height * scale)))
         image = oiio.ImageBufAlgo.resize(image, roi=roi)
-    return image, time
+    return oiio.ImageBufAlgo.reorient(image), time  # last: it copies the image
 
 
 def _time(spec: oiio.ImageSpec) -> float | None:
