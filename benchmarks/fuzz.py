@@ -22,7 +22,7 @@ from random import Random
 from fuzzing.kinds import KINDS
 from fuzzing.rows import Outcome, Row, distinct, table
 
-BATCH = 2_500  # inputs that one process reads
+BATCH = 10_000  # inputs that one process reads
 WALL_S = 120.0  # without a line; CPU time is limited by the process itself
 
 

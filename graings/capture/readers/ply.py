@@ -5,6 +5,7 @@ It is not read by a library, because a truncated file must be distinguished from
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Final, NoReturn
 
@@ -26,6 +27,7 @@ _TYPES: Final = {
 _ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _POSITION: Final = ("x", "y", "z")
 _COLOR: Final = ("red", "green", "blue")
+_COUNT: Final = re.compile("[0-9]{1,18}")  # Python refuses to read numbers of any length
 _HEADER_END: Final = b"end_header"
 _GREY: Final = 0.5
 
@@ -76,7 +78,7 @@ def _header(name: str, data: bytes) -> _Header:
             continue
         if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
             order = _ORDERS[words[1]]
-        elif words[0] == "element" and len(words) == 3 and words[2].isascii() and words[2].isdigit():
+        elif words[0] == "element" and len(words) == 3 and _COUNT.fullmatch(words[2]):
             elements.append((words[1], int(words[2])))
         elif words[0] == "property" and elements:
             if elements[-1][0] != "vertex":
