@@ -82,4 +82,4 @@ def _time(spec: oiio.ImageSpec) -> float | None:
     except ValueError:
         return None  # a tag that some programs leave empty or write in words
     fraction = str(spec.getattribute("Exif:SubsecTimeOriginal") or "").strip()
-    return moment.timestamp() + (float(f"0.{fraction}") if fraction.isdigit() else 0.0)
+    return moment.timestamp() + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)

