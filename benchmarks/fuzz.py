@@ -4,7 +4,7 @@
 
 Each input is made from a valid seed by its number, the kind and `--seed`, so one can be made again. It is read, or
 refused with an error class of ours that names the file, or a fault: another exception, the end of the process, more
-than 3 GB or 20 CPU seconds, or a message with a path of the machine, a stack trace, the whole input or letters that do
+than 3 GB or 60 CPU seconds, or a message with a path of the machine, a stack trace, the whole input or letters that do
 not print. `--keep` writes the inputs of faults to a folder. The table is Markdown; the exit code is 1 after a fault.
 """
 

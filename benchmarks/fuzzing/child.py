@@ -31,7 +31,7 @@ from graings.errors import MAX_MESSAGE, GraingsError
 from service.problems import ServiceError
 
 MEMORY_MB = 3_072  # an image of the greatest size that is read takes 1 GB, and its stored pixels beside
-CPU_S = 20.0
+CPU_S = 60.0  # a photograph of the greatest size that is read takes 18
 MESSAGE = MAX_MESSAGE + 300  # characters; the parts of a message are limited, and it has several
 ROOT = Path(__file__).resolve().parents[2]
 # Names that no message may give away; what the input itself contains does not count.
