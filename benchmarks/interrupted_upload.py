@@ -2,7 +2,7 @@
 
     python benchmarks/interrupted_upload.py [--bytes 2000000000] [--interruptions 5]
 
-Starts `graings serve` on a temporary folder and sends an archive of random bytes, in a zip without compression, by the
+Starts `graings serve` on a temporary folder and sends an archive of noise, in a zip without compression, by the
 Python client over a connection that breaks after every so many bytes, without notice to the client. The bytes that
 went over the broken and the whole connections are counted on the way. Then a job is made of the upload, which the
 service refuses because it is no capture: by then it has hashed and unpacked it. Memory is the greatest resident size of
@@ -79,8 +79,9 @@ def main() -> None:
         folder = Path(name)
         archive = folder / "large.zip"
         with zipfile.ZipFile(archive, "w") as packed, packed.open("noise.bin", "w", force_zip64=True) as entry:
+            noise = os.urandom(CHUNK)
             for _ in range(options.bytes // CHUNK):
-                entry.write(os.urandom(CHUNK))
+                entry.write(noise)
         size = archive.stat().st_size
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = free.getsockname()[1]
@@ -95,18 +96,18 @@ def main() -> None:
             idle = peak_mb(server.pid)
             line = Line(port, size // (options.interruptions + 1), options.interruptions)
             began = time.monotonic()
-            with Client(f"http://127.0.0.1:{line.port}") as client:
+            with Client(f"http://127.0.0.1:{line.port}", timeout=None) as client:
                 upload = client.upload(archive)
-                seconds, received = time.monotonic() - began, peak_mb(server.pid)
+                print("| | |\n|---|---:|")
+                print(f"| archive, bytes | {size:,} |\n| interruptions | {line.broken} |")
+                print(f"| sent, bytes | {line.sent:,} |\n| sent again | {line.sent / size - 1:.2%} |")
+                print(f"| seconds, pauses included | {time.monotonic() - began:.0f} |")
+                print(f"| memory of the API before, MB | {idle} |")
+                print(f"| after the upload | {peak_mb(server.pid)} |", flush=True)
                 try:
                     client._do(calls.submit(upload, "noise", "draft", None, 10, None, "once"))
                 except RefusedError as error:
                     answer = str(error)
-            print("| | |\n|---|---:|")
-            print(f"| archive, bytes | {size:,} |\n| interruptions | {line.broken} |")
-            print(f"| sent, bytes | {line.sent:,} |\n| sent again | {line.sent / size - 1:.2%} |")
-            print(f"| pauses included, s | {seconds:.0f} |")
-            print(f"| memory of the API before, MB | {idle} |\n| after the upload | {received} |")
             print(f"| after it was unpacked | {peak_mb(server.pid)} |\n\n{answer}")
         finally:
             server.terminate()
