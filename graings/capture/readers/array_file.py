@@ -25,7 +25,7 @@ def read_array(folder: CaptureFolder, name: str, *, columns: int) -> NDArray[np.
         shape, by_column, dtype = _header(file)
     except (ValueError, TypeError, SyntaxError, tokenize.TokenError, ArithmeticError, RecursionError) as error:
         _fail(name, f"is no array ({error})")
-    if len(shape) != 2 or shape[1] != columns or shape[0] < 1:
+    if [type(size) for size in shape] != [int, int] or shape[1] != columns or shape[0] < 1:  # True is an int, too
         _fail(name, f"holds {shape}, not (N, {columns}) numbers", "shape")
     if dtype.kind not in "fiu":
         _fail(name, f"holds {dtype}", "dtype")
