@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -74,11 +75,14 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
     shape = restored(SceneConfig, facts["scene_config"], path)
     rows = {name: tensors[f"scaffold.{name}"] for name in Scaffold.ROWS}
     views = {split: tuple(map(_view_from_json, members)) for split, members in facts["views"].items()}
+    rates = {name: float(value) for name, value in facts["sampling_rate"].items()}
+    if not all(0.0 < value < math.inf for value in rates.values()):
+        raise ValueError(f"sampling rates must be positive and finite, got {rates}")
     scene = Scene(
         shape,
         Scaffold(**rows),
         extent=float(tensors["extent"]),
-        sampling=SamplingRate(**facts["sampling_rate"]),
+        sampling=SamplingRate(**rates),
         initial_opacity=0.1,
     )
     scene.load_state_dict(tensors)

@@ -71,7 +71,7 @@ def test_an_array_that_declares_more_than_it_holds_is_refused(tmp_path: Path, ro
     ["", "(" * 300, "((", "{", "{'descr': '<f8'}", "x" * 20_000, "{'descr': [], 'fortran_order': False, 'shape': ()}"]
     + [
         f"{{'descr': '<f8', 'fortran_order': False, 'shape': {s}}}"
-        for s in ("3", "(3,)", "(1.5, 3)", "('a', 3)", "(0, 3)")
+        for s in ("3", "(3,)", "(1.5, 3)", "(True, 3)", "('a', 3)", "(0, 3)")
     ]
     + [f"{{'descr': {d}, 'fortran_order': False, 'shape': (1, 3)}}" for d in ("3", "None", "('<f8', -1)", "'\\0'")],
 )

@@ -158,19 +158,26 @@ def test_an_upload_is_continued_from_any_byte(address: tuple[str, int], settings
         def arrived() -> int:
             return int(remote._do(calls.upload_state(upload))["received"])
 
-        start = 0
-        for end in (1, 2, 1_000, 65_535, 65_536, 65_537, 200_000, 299_999):
+        def interrupted(end: int) -> None:
+            """A request for all the rest whose connection breaks before byte `end`."""
+            start = arrived()
             head = (
                 f"PUT /uploads/{upload} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {len(archive) - start}\r\n"
                 f"Content-Range: bytes {start}-{len(archive) - 1}/{len(archive)}\r\n\r\n"
             )
             with socket.create_connection(address) as connection:
                 connection.sendall(head.encode() + archive[start:end])
-                limit = time.monotonic() + 20.0
+                limit = time.monotonic() + 3.0
                 while end % 2 and arrived() < end and time.monotonic() < limit:
                     time.sleep(0.02)
-            start = arrived()
-            assert start == end if end % 2 else start <= end
+
+        for end in (1, 2, 1_001, 65_535, 65_536, 65_537, 200_000, 299_999):
+            interrupted(end)
+            for _ in range(10):  # a request that was broken off may have written after this one asked
+                if end % 2 and arrived() < end:
+                    interrupted(end)
+            assert arrived() == end if end % 2 else arrived() <= end
+        start = arrived()
         while start < len(archive):  # the requests that were broken off may still be writing
             try:
                 part = calls.send_part(upload, start, len(archive), len(archive))

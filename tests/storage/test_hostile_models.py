@@ -70,6 +70,15 @@ def test_any_value_of_any_fact_is_read_or_refused(packed: bytes, tmp_path: Path)
         for value in STRANGE:
             changed = {**facts, "views": {"train": [{**view, key: value}], "val": []}}
             read_or_refused(tmp_path / "a.graings", with_facts(packed, changed))
+    for key in facts["sampling_rate"]:
+        for value in (0, -1, 10**400, 1e308, "x", None):
+            changed = {**facts, "sampling_rate": {**facts["sampling_rate"], key: value}}
+            read_or_refused(tmp_path / "a.graings", with_facts(packed, changed))
+        (tmp_path / "a.graings").write_bytes(
+            with_facts(packed, {**facts, "sampling_rate": {**facts["sampling_rate"], key: 0}})
+        )
+        with pytest.raises(CheckpointError, match="sampling rates"):
+            read_compact(tmp_path / "a.graings")
     for text in ("[" * 100_000, '{"a":' * 100_000, "NaN", "[]", "null", ""):
         read_or_refused(tmp_path / "a.graings", with_facts(packed, text))
 
