@@ -31,7 +31,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = {"iterations": 40, "init.points": 30_000, "init.voxel_size": 0.02, "scene.children": 4, "threads": 1}
     options |= {
         f"scene.{name}": 32 for name in ("head_width", "deform_width", "time_width", "static_width")
-    }  # anchors are most of it
+    }  # anchors are most of it, and stay most of it
+    options["density.unseen_pixels"] = 0.0
     list(TrainingRun.create(capture, folder / "run", make_config("draft", options)))
     return folder / "run"
 
