@@ -144,9 +144,9 @@ BROKEN: dict[str, tuple[Callable[[Path], Any], str]] = {
         r"metadata\.json, 0_00003: the entry",
     ),
     "points that are text": (cut("points.npy", lambda d: b"text"), r"points\.npy: is no array"),
-    "points that are objects": (array(np.array([[{}, {}, {}]], dtype=object)), r"points\.npy: is no array"),
+    "points that are objects": (array(np.array([[{}, {}, {}]], dtype=object)), r"points\.npy, dtype: holds object"),
     "points of two numbers": (array(np.zeros((4, 2))), r"points\.npy, shape: holds \(4, 2\), not \(N, 3\)"),
-    "truncated points": (cut("points.npy", lambda d: d[:-5]), r"points\.npy: is no array"),
+    "truncated points": (cut("points.npy", lambda d: d[:-5]), r"points\.npy: is truncated: it declares \d+ rows"),
     "nothing to train on": (
         cut(
             "dataset.json",

@@ -27,7 +27,7 @@ _TYPES: Final = {
 _ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _POSITION: Final = ("x", "y", "z")
 _COLOR: Final = ("red", "green", "blue")
-_COUNT: Final = re.compile("[0-9]{1,18}")  # Python refuses to read numbers of any length
+_COUNT: Final = re.compile("[0-9]{1,40}")  # Python refuses to read numbers of any length
 _HEADER_END: Final = b"end_header"
 _GREY: Final = 0.5
 
