@@ -239,7 +239,7 @@ def test_the_client_continues_over_a_connection_that_breaks(
 ) -> None:
     monkeypatch.setattr(calls, "RECONNECT_S", 0.05)
     monkeypatch.setattr(sending, "CHUNK", 1_000)
-    with Flaky(address, 12_000, left=3) as flaky, Client(f"http://127.0.0.1:{flaky.port}") as remote:
+    with Flaky(address, 3_000, left=3) as flaky, Client(f"http://127.0.0.1:{flaky.port}") as remote:
         job = remote.submit(capture, preset="draft")
         assert (job.state, flaky.left) == ("queued", 0)
         assert len(list((settings.data / "captures").rglob("*.png"))) == len(list(capture.rglob("*.png")))
