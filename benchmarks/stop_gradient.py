@@ -153,7 +153,7 @@ def figure(folder: Path, seed: int) -> str:
             panels[1].plot(steps, curve["cosine"], color=color)
             panels[2].plot(steps, [100 * value for value in curve["drift_median"]], color=color)
             panels[2].plot(steps, [100 * value for value in curve["drift_p90"]], color=color, linestyle=":")
-        panels[0].set_yscale("log")
+        panels[0].set_ylim(bottom=0.0)
         panels[0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         panels[0].set_title("gradient norm: direct, blocked (dashed)", loc="left")
         panels[1].axhline(0, color="#9aa0a6", linewidth=0.8)
