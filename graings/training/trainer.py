@@ -36,6 +36,7 @@ from graings.scene.scene import Composition, Scene
 from graings.training.guard.collapse import RESET_OPACITY, raise_opacity
 from graings.training.guard.guard import Gradient, Guard, StepCheck, first_not_finite
 from graings.training.guard.stiffness import step_over_size
+from graings.training.parameter_average import ParameterAverage
 from graings.training.step_report import StepReport
 from graings.training.trainer_state import TrainerState
 
@@ -191,10 +192,13 @@ class Trainer(TrainerState):
         """Average the parameters of the last steps, in which no anchor is added or removed, and end with the mean."""
         config = self.config.density
         last_change = max(self.config.average_from, config.grow_until, config.prune_until)
-        if self.iteration > self.config.scaled(last_change):
-            self.average.add(self.scene)
-            if self.iteration == self.config.iterations:
-                self.average.apply(self.scene)
+        if self.iteration <= self.config.scaled(last_change):
+            if self.average.steps > 0:  # of the end of a run that was extended: anchors change again
+                self.average = ParameterAverage()
+            return
+        self.average.add(self.scene)
+        if self.iteration == self.config.iterations:
+            self.average.apply(self.scene)
 
     def _check_health(self, drawn: int, difference: float) -> list[Event]:
         """Detect a collapsed or diverged scene and roll back; take a snapshot of a healthy one. Returns the events."""
@@ -267,6 +271,7 @@ class Trainer(TrainerState):
         """Remove all anchors but those of the mask `keep` [A]."""
         self.optimizer.keep(keep)
         self.density.statistics.resize(keep=keep)
+        self.average = ParameterAverage()
 
     def restore(self) -> None:
         """Return to the newest snapshot, and its iteration, for good: training has diverged."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,10 @@ import torch
 
 from graings.render import render
 from graings.report.metrics_document import read_metrics
+from graings.report.run_record import read_record
 from graings.storage.compact import open_model
+from graings.storage.files import write_document
+from graings.storage.run_folder import RECORD_FILE
 from graings.training.density.unseen import drop_unseen, largest_contributions
 from graings.training.run import TrainingRun
 from tests.training.micro import micro_config
@@ -62,6 +66,24 @@ def test_a_run_ends_without_them_and_says_so(micro: Path, tmp_path: Path) -> Non
     assert not [event for event in read_metrics(kept.metrics_path).events if event.kind == "unseen"]
     assert open_model(run.folder).scene.scaffold.count == run.trainer.scene.scaffold.count
     assert metrics.curve[-1].anchors == run.trainer.scene.scaffold.count
+
+
+@pytest.mark.parametrize("pixels", [0.0, 0.5])
+@pytest.mark.parametrize("more", [2, 40, 100])  # in which anchors do not change again, are pruned, and grow
+def test_a_run_that_was_extended_trains_to_its_new_end(micro: Path, tmp_path: Path, pixels: float, more: int) -> None:
+    folder = tmp_path / "run"
+    config = micro_config(iterations=60, **{"density.unseen_pixels": pixels, "init.points": 400})
+    for _ in (run := TrainingRun.create(micro, folder, config)):
+        pass
+    assert run.trainer.average.steps == (2 if pixels == 0 else 0)
+    record = read_record(folder)
+    longer = record.model_copy(update={"config": record.config.model_copy(update={"iterations": 60 + more})})
+    write_document(folder / RECORD_FILE, longer)
+    extended = TrainingRun.resume(folder)
+    for step in extended:
+        assert math.isfinite(step.loss)
+    assert extended.iteration == 60 + more
+    assert open_model(folder).scene.scaffold.count == extended.trainer.scene.scaffold.count
 
 
 @pytest.mark.parametrize("pixels", [0.2, 1e9])
