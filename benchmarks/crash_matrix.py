@@ -41,7 +41,7 @@ def unavailable(fault: Fault, backend: str) -> str | None:
         return "PostgreSQL is not installed"
     if fault.clock and not list(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1")):
         return "libfaketime is not installed"
-    return network.unavailable() if fault.cabled or fault.disk else None
+    return network.unavailable() if fault.linked or fault.disk else None
 
 
 @contextmanager
@@ -55,12 +55,12 @@ def prepared(fault: Fault, backend: str, capture: Path, stack: ExitStack) -> Ite
         around.disk = stack.enter_context(small_disk(data))
     elif fault.disk == "database":
         around.disk = stack.enter_context(small_disk(folder / "disk", "24m" if backend == "sqlite" else "160m"))
-    if fault.cabled:
-        around.cable = stack.enter_context(network.cable())
+    if fault.linked:
+        around.link = stack.enter_context(network.link())
     url = f"sqlite:///{around.disk or data}/jobs.sqlite"
     if backend == "postgresql":
-        host = {"server": network.THERE, "worker": network.HERE, None: "127.0.0.1"}[fault.cabled]
-        prefix = network.Cable.prefix if fault.cabled == "server" else ()
+        host = {"server": network.THERE, "worker": network.HERE, None: "127.0.0.1"}[fault.linked]
+        prefix = network.Link.prefix if fault.linked == "server" else ()
         place = around.disk if fault.disk == "database" else None
         around.server = stack.enter_context(running(host, prefix, place))
         url = around.server.url

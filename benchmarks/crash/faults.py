@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from crash.network import Cable
+from crash.network import Link
 from crash.stage import BRIEF, Stage, full
 
 from client import ClientError
@@ -52,11 +52,11 @@ typer.run(commands.worker)
 
 @dataclass
 class Around:
-    """What is around a stage: the small disk, the server and the cable, if the fault has asked for them."""
+    """What is around a stage: the small disk, the server and the link, if the fault has asked for them."""
 
     disk: Path | None = None
     server: Server | None = None
-    cable: Cable | None = None
+    link: Link | None = None
     clock: Path | None = None
 
 
@@ -83,7 +83,7 @@ class Fault:
     start: Callable[[Stage, Around], None] = one_worker
     backends: tuple[str, ...] = ("sqlite", "postgresql")
     disk: str | None = None  # "data", "database": which of them is on a small disk
-    cabled: str | None = None  # "server", "worker": which of them is behind a cable
+    linked: str | None = None  # "server", "worker": which of them is behind a link
     clock: bool = False
     starts_idle: bool = False  # the fault comes before the training
     expects: str = ""
@@ -253,12 +253,12 @@ def pg_crash(stage: Stage, around: Around) -> None:
     stage.over()
 
 
-@fault("pg-cut", f"PostgreSQL cut off for {CUT_S:g} s", backends=("postgresql",), start=two_workers, cabled="server")
+@fault("pg-cut", f"PostgreSQL cut off for {CUT_S:g} s", backends=("postgresql",), start=two_workers, linked="server")
 def pg_cut(stage: Stage, around: Around) -> None:
-    assert around.cable is not None
-    around.cable.cut()
+    assert around.link is not None
+    around.link.cut()
     time.sleep(CUT_S)
-    around.cable.mend()
+    around.link.mend()
     stage.over()
 
 
@@ -296,9 +296,9 @@ def worker_upgrade(stage: Stage, around: Around) -> None:
 
 
 def three_machines(stage: Stage, around: Around) -> None:
-    assert around.cable is not None
-    stage.start_worker(prefix=around.cable.prefix)
-    stage.until(lambda: around_alive(stage) == 1, "the worker behind the cable has started")
+    assert around.link is not None
+    stage.start_worker(prefix=around.link.prefix)
+    stage.until(lambda: around_alive(stage) == 1, "the worker behind the link has started")
     stage.late = [stage.start_worker, stage.start_worker]  # the first one takes the job
 
 
@@ -312,14 +312,14 @@ def around_alive(stage: Stage) -> int:
 
 @fault(
     "machine-gone", "three workers; the machine of the one that trains disappears",
-    backends=("postgresql",), start=three_machines, cabled="worker",
+    backends=("postgresql",), start=three_machines, linked="worker",
 )  # fmt: skip
 def machine_gone(stage: Stage, around: Around) -> None:
-    assert around.cable is not None
+    assert around.link is not None
     for start in stage.late:
         start()
     stage.until(lambda: around_alive(stage) == 3, "three workers live")
-    around.cable.cut()
+    around.link.cut()
     stage.kill(stage.workers[0].pid, *stage.trainers())
     stage.over()
     stage.watch("its lease ends", lambda: around_alive(stage) == 2)
@@ -328,18 +328,18 @@ def machine_gone(stage: Stage, around: Around) -> None:
 
 @fault(
     "worker-cut", f"three workers; the one that trains lives on, cut off from PostgreSQL for {CUT_S:g} s",
-    backends=("postgresql",), start=three_machines, cabled="worker",
+    backends=("postgresql",), start=three_machines, linked="worker",
 )  # fmt: skip
 def worker_cut(stage: Stage, around: Around) -> None:
-    assert around.cable is not None
+    assert around.link is not None
     for start in stage.late:
         start()
-    around.cable.cut()
+    around.link.cut()
     began = time.monotonic()
     stage.over()
     stage.watch("its lease ends", lambda: around_alive(stage) == 2)
     time.sleep(max(0.0, CUT_S - (time.monotonic() - began)))
-    around.cable.mend()
+    around.link.mend()
     stage.over()
 
 

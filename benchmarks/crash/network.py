@@ -1,6 +1,6 @@
-"""A network of its own for one process, on a cable that can be cut: what happens when a machine disappears.
+"""A network of its own for one process, on a link that can be cut: what happens when a machine disappears.
 
-Packets are dropped in silence while the cable is cut, as after a power failure, and no connection is closed. Needs root
+Packets are dropped in silence while the link is cut, as after a power failure, and no connection is closed. Needs root
 and `ip` (iproute2).
 """
 
@@ -16,7 +16,7 @@ HERE, THERE = "10.213.7.1", "10.213.7.2"
 _NAME, _OUTSIDE, _INSIDE = "graings-crash", "gcrash0", "gcrash1"
 
 
-class Cable:
+class Link:
     """The connection between this machine (`HERE`) and the processes behind `prefix` (`THERE`)."""
 
     prefix = ("ip", "netns", "exec", _NAME)
@@ -36,7 +36,7 @@ def unavailable() -> str | None:
 
 
 @contextmanager
-def cable() -> Iterator[Cable]:
+def link() -> Iterator[Link]:
     """A network for as long as the context lasts."""
     _ip("netns", "add", _NAME)
     try:
@@ -46,7 +46,7 @@ def cable() -> Iterator[Cable]:
         _ip("-n", _NAME, "address", "add", f"{THERE}/30", "dev", _INSIDE)
         for name in (_INSIDE, "lo"):
             _ip("-n", _NAME, "link", "set", name, "up")
-        yield Cable()
+        yield Link()
     finally:
         _ip("netns", "delete", _NAME)
 

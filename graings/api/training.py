@@ -58,6 +58,7 @@ def train(
 def evaluate_run(run: FilePath, split: Split = "test") -> SplitMetrics:
     """PSNR, SSIM and more on held-out views, also written into the run's `metrics.json`.
 
-    Raises `CheckpointError` where there is no model, and `CaptureError` where the capture has no such views.
+    Values are None, with a `reason`, where the capture has no such views. Raises `CheckpointError` where there is no
+    model, and `CaptureError` for a capture that cannot be read.
     """
     return evaluate_and_record(Path(run), split)

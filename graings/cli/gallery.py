@@ -29,4 +29,4 @@ def gallery(
             )
         except ValueError as error:
             raise typer.BadParameter(str(error), param_hint="RUN") from error
-    print_line(f"{page}: {len(runs)} models. Open it in a browser.")
+    print_line(f"{page}: open it in a browser.")
