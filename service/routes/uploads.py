@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 
 from service.access import CallerDep
 from service.context import MB, ContextDep
-from service.problems import RESPONSES, BadRequest, TooLarge, UploadNotFound
+from service.problems import RESPONSES, TooLarge, UploadConflict, UploadNotFound
 from service.resumable import ResumableUpload
 
 router = APIRouter(prefix="/uploads", tags=["uploads"], responses=RESPONSES)
@@ -87,10 +87,12 @@ async def put(
     """Append the bytes in the body. Those that arrive before an interruption count."""
     place, last, size = map(int, re.findall(r"\d+", content_range))
     if size != upload.size or not place <= last < size:
-        raise BadRequest(f"Content-Range: must be bytes FIRST-LAST/{upload.size} with FIRST <= LAST < {upload.size}.")
+        raise UploadConflict(
+            f"Content-Range: must be bytes FIRST-LAST/{upload.size} with FIRST <= LAST < {upload.size}."
+        )
     async for chunk in request.stream():
         if place + len(chunk) > last + 1:
-            raise BadRequest("Content-Range: the body has more bytes than the range.")
+            raise UploadConflict("Content-Range: the body has more bytes than the range.")
         place = await to_thread.run_sync(upload.append, place, chunk)
     return UploadResource.of(upload)
 
