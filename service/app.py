@@ -35,11 +35,15 @@ SWITCH_S = 0.001
 
 
 class Service(FastAPI):
-    """The application, with the schemas of its errors in its description."""
+    """The application, with the schemas of its errors and the limit of uploads in its description."""
+
+    max_upload_bytes: int
 
     def openapi(self) -> dict[str, Any]:
         document = super().openapi()
         document["components"]["schemas"].update(problems.SCHEMAS)
+        (size,) = (part for part in document["paths"]["/uploads"]["post"]["parameters"] if part["name"] == "bytes")
+        size["schema"]["maximum"] = self.max_upload_bytes
         return document
 
 
@@ -70,6 +74,7 @@ def create_app(settings: Settings) -> FastAPI:
         docs_url=None,  # its own page loads scripts from other sites
         redoc_url=None,
     )
+    app.max_upload_bytes = settings.max_upload_mb * MB
     app.add_middleware(BodyLimit, limit=limit)
     app.add_middleware(SameOrigin, allowed_hosts=settings.allowed_host_names)
     problems.install(app)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 
 from service.access import CallerDep
 from service.context import MB, ContextDep
-from service.problems import RESPONSES, TooLarge, UploadConflict, UploadNotFound
+from service.problems import RESPONSES, BadRequest, UploadConflict, UploadNotFound
 from service.resumable import ResumableUpload
 
 router = APIRouter(prefix="/uploads", tags=["uploads"], responses=RESPONSES)
@@ -64,7 +64,7 @@ def begin(
 ) -> UploadResource:
     """Begin an upload that can be continued after an interruption. It belongs to the key of the request."""
     if size > context.settings.max_upload_mb * MB:
-        raise TooLarge(f"An archive may have at most {context.settings.max_upload_mb * MB} bytes.")
+        raise BadRequest(f"bytes: an archive may have at most {context.settings.max_upload_mb * MB} bytes.")
     upload = context.resumable.begin(size, caller.owner)
     response.headers["Location"] = f"/uploads/{upload.path.name}"
     return UploadResource.of(upload)

@@ -56,3 +56,10 @@ def test_the_stream_of_events_names_the_schemas_of_its_data(openapi: dict[str, A
     assert set(names) <= openapi["components"]["schemas"].keys()
     kinds = openapi["components"]["schemas"]["ProgressReport"]["properties"]["events"]["items"]["discriminator"]
     assert {"grew", "rolled_back", "restart"} <= kinds["mapping"].keys()
+
+
+def test_the_limit_of_uploads_is_in_the_document(client: TestClient) -> None:
+    parameters = client.get("/openapi.json").json()["paths"]["/uploads"]["post"]["parameters"]
+    assert [part["schema"]["maximum"] for part in parameters if part["name"] == "bytes"] == [1_000_000]
+    assert client.post("/uploads?bytes=1000000").status_code == 201
+    assert client.post("/uploads?bytes=1000001").status_code == 422

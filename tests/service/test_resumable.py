@@ -95,7 +95,7 @@ def test_only_the_next_bytes_are_accepted(client: TestClient, archive: bytes) ->
 def test_the_limits_are_those_of_other_uploads(client: TestClient, settings: Settings) -> None:
     most = settings.max_upload_mb * 1_000_000
     assert client.post(f"/uploads?bytes={most}").status_code == 201
-    assert client.post(f"/uploads?bytes={most + 1}").json()["type"] == "urn:graings:problem:too-large"
+    assert client.post(f"/uploads?bytes={most + 1}").json()["type"] == "urn:graings:problem:bad-parameter"
     assert client.post("/uploads?bytes=0").status_code == 422
     large = begin(client, b"x" * 2_000)
     assert client.put(f"/uploads/{large}", content=bytes(most + 1)).status_code == 413
