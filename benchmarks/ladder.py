@@ -64,6 +64,7 @@ ROWS = (
         ("init.max_points", "density.max_growth", "density.max_anchors", "density.memory_mb"),
     ),
     Row("average", "averaging of the last steps", ("average_from",)),
+    Row("unseen", "anchors that no training view shows removed at the end", ("density.unseen_pixels",)),
     Row(
         "curriculum",
         "time window, guard that rolls back, background of the capture",
