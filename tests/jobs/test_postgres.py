@@ -17,7 +17,11 @@ from jobs.job import JobError, JobState
 from jobs.lease import PostgresLeases, open_leases
 from jobs.queue import JobQueue
 from jobs.store import Store
+from jobs.webhooks import PRIVATE
 from tests.jobs.postgres_server import Server, is_installed, running
+from tests.jobs.test_webhooks import Receiver, wait_for_end, working_here
+from tests.jobs.test_webhooks import receiver as receiver
+from tests.jobs.test_webhooks import submit as submit_with_webhook
 from tests.jobs.test_worker import ENDLESS, is_idle, submit, until, working
 
 pytestmark = pytest.mark.slow(reason="starts a PostgreSQL server and real workers")
@@ -197,4 +201,28 @@ def test_another_worker_continues_the_job_of_a_killed_one(url: str, tmp_path: Pa
         until(lambda: (folder.checkpoint() or 0) > taken_over.checkpoint > 0)
         assert jobs.cancel(job_id).state is JobState.CANCELLED
         until(lambda: is_idle(jobs, job_id))
+    engine.close()
+
+
+def test_a_webhook_is_told_after_failures_and_again_when_the_job_was_extended(
+    url: str, tmp_path: Path, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("jobs.worker.RETRY_AFTER_S", (0.2,) * 5)
+    monkeypatch.setenv(PRIVATE, "1")
+    receiver.statuses = [500, 503, 200]
+    engine = Engine(url)
+    jobs = JobQueue(Store(tmp_path / "data"), engine)
+    job = submit_with_webhook(jobs, receiver.url)
+    with working_here(jobs, url):
+        messages = wait_for_end(jobs, job, receiver)
+        ids = [headers["webhook-id"] for headers, _ in receiver.got]
+        assert ids.count(f"{job}.started.1") == 3  # two failures, then success
+        until(lambda: is_idle(jobs, job))
+        jobs.extend(job, 20)
+        messages = wait_for_end(jobs, job, receiver, ends=2)
+        until(lambda: is_idle(jobs, job))
+    ended = [message["data"]["checkpoint"] for message in messages if message["type"] == "job.ended"]
+    assert ended == [30, 50]
+    assert jobs.get(job).state is JobState.SUCCEEDED
+    jobs.delete(job)
     engine.close()

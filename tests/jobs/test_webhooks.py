@@ -7,7 +7,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,33 @@ def submit(jobs: JobQueue, webhook: str) -> str:
     return jobs.submit(JobSpec("job", "0" * 64, config, webhook=webhook), unpacked).id
 
 
+@contextmanager
+def working_here(jobs: JobQueue, database: str) -> Iterator[None]:
+    """A worker in a thread of this process, so that its constants can be changed."""
+    stop = threading.Event()
+    worker = Worker(jobs.store, database)
+    thread = threading.Thread(target=worker.run, args=(stop,))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def wait_for_end(jobs: JobQueue, job: str, receiver: Receiver, ends: int = 1) -> list[dict[str, Any]]:
+    """The messages of a job so far, once `ends` of them say that it ended; refused or not, each one is verified."""
+    secret = jobs.get(job).spec.webhook_secret
+    assert secret is not None
+    deadline = time.monotonic() + LONG_S
+    while True:
+        messages = [Webhook(secret).verify(body, headers) for headers, body in receiver.got]
+        if sum(message["type"] == "job.ended" for message in messages) >= ends:
+            return messages
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
 def test_a_job_tells_its_webhook_what_happens_and_tries_again(
     jobs: JobQueue, receiver: Receiver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -93,21 +120,8 @@ def test_a_job_tells_its_webhook_what_happens_and_tries_again(
     monkeypatch.setenv(PRIVATE, "1")
     receiver.statuses = [500, 503, 200]
     job = submit(jobs, receiver.url)
-    secret = jobs.get(job).spec.webhook_secret
-    assert secret is not None
-    stop = threading.Event()
-    worker = Worker(jobs.store, default_database(jobs.store.root))
-    thread = threading.Thread(target=worker.run, args=(stop,))
-    thread.start()
-    deadline = time.monotonic() + LONG_S
-    messages: list[dict[str, Any]] = []
-    while not any(message["type"] == "job.ended" for message in messages):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-        # Every message, refused or not, is what the library's own verifier takes.
-        messages = [Webhook(secret).verify(body, headers) for headers, body in receiver.got]
-    stop.set()
-    thread.join()
+    with working_here(jobs, default_database(jobs.store.root)):
+        messages = wait_for_end(jobs, job, receiver)
     ids = [headers["webhook-id"] for headers, _ in receiver.got]
     assert ids.count(f"{job}.started.1") == 3  # two failures, then success
     assert messages[0]["type"] == "job.started"
