@@ -10,22 +10,18 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import HttpUrl
 
 from graings.config import PRESETS, make_config
-from jobs.job import ID_PATTERN, CaptureNotFound, Job, JobSpec, JobState
-from service.access import Caller, CallerDep
-from service.context import Context, ContextDep, JobId
+from jobs.job import ID_PATTERN, Job, JobSpec, JobState
+from service.access import CallerDep
+from service.context import ContextDep, JobId
 from service.inspection import inspect_capture
-from service.problems import RESPONSES, BadRequest
-from service.routes.uploads import owned
+from service.problems import RESPONSES
 from service.schemas import JobPage, JobResource, job_resource, job_summary
-from service.uploads import CAPTURE_BODY, parse_config, receive_capture, scene_capture
+from service.sent_capture import OPTIONAL_BODY, CaptureParam, sent_capture
+from service.uploads import parse_config
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], responses=RESPONSES)
 
 RETRY_AFTER_S = "2"
-_UPLOAD_ID = 32  # letters; a capture has 64
-
-# Without a body where `capture` names one that was sent before, or `scene` a synthetic one.
-OPTIONAL_BODY = {"requestBody": {**CAPTURE_BODY["requestBody"], "required": False}}
 
 
 @router.post("", status_code=202, operation_id="submit_job", openapi_extra=OPTIONAL_BODY)
@@ -50,13 +46,7 @@ async def submit(
         str | None,
         Header(max_length=255, description="Of the client's choice: the same request with it again makes no new job."),
     ] = None,
-    capture: Annotated[
-        str | None,
-        Query(
-            pattern=r"^([0-9a-f]{64}|[0-9a-f]{32})$",
-            description="Instead of a body: `capture` of one of your jobs, or the `id` of a complete upload.",
-        ),
-    ] = None,
+    capture: CaptureParam = None,
     scene: Annotated[
         str | None,
         Query(max_length=40, description="A synthetic scene of /options, instead of a body: the job draws it first."),
@@ -65,32 +55,17 @@ async def submit(
     """Queue a training job on the capture in the body: an archive, or a multipart form with one as `capture`."""
     overrides = {} if config is None else parse_config(config, "config")
     # Checked before the body is read, so that a typing error is reported before gigabytes are uploaded.
-    again = make_config(preset, overrides)
+    make_config(preset, overrides)
     title = name or scene or "untitled"
-    if capture is not None and scene is not None:
-        raise BadRequest("capture, scene: choose one of them.")
     webhook_address = None if webhook is None else str(webhook)
-    resumed = None
-    if capture is not None and len(capture) == _UPLOAD_ID:
-        resumed = await to_thread.run_sync(owned, context, caller, capture)
-        capture = resumed.capture
-    elif capture is not None:
-        await to_thread.run_sync(_check_used, context, caller, capture)
-    if capture is not None:
-        if not context.store.capture(capture).is_dir():
-            raise CaptureNotFound(capture)
-        await inspect_capture(context.store.capture(capture), again.capture)
-        spec = JobSpec(title, capture, again.model_dump(mode="json"), priority, caller.owner, webhook_address)
-        return _accepted(await to_thread.run_sync(context.jobs.submit, spec, None, idempotency_key), response)
-    uploads, archive = context.store.uploads, None if resumed is None else resumed.whole()
-    received = receive_capture(request, uploads, context.limits, archive)
-    async with received if scene is None else scene_capture(scene, uploads) as upload:
-        chosen = make_config(preset, {**overrides, **upload.config})
-        await inspect_capture(upload.folder, chosen.capture)
-        spec = JobSpec(title, upload.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
-        job = await to_thread.run_sync(context.jobs.submit, spec, upload.folder, idempotency_key)
-        if resumed is not None:
-            await to_thread.run_sync(resumed.write, upload.digest)
+    async with sent_capture(request, context, caller, capture, scene) as sent:
+        chosen = make_config(preset, {**overrides, **sent.config})
+        await inspect_capture(sent.folder, chosen.capture)
+        spec = JobSpec(title, sent.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
+        folder = None if sent.stored else sent.folder
+        job = await to_thread.run_sync(context.jobs.submit, spec, folder, idempotency_key)
+        if sent.upload is not None:
+            await to_thread.run_sync(sent.upload.write, sent.digest)
     return _accepted(job, response)
 
 
@@ -98,13 +73,6 @@ def _accepted(job: Job, response: Response) -> JobResource:
     response.headers["Location"] = f"/jobs/{job.id}"
     response.headers["Retry-After"] = RETRY_AFTER_S
     return job_resource(job).model_copy(update={"webhook_secret": job.spec.webhook_secret})
-
-
-def _check_used(context: Context, caller: Caller, digest: str) -> None:
-    """Raise `CaptureNotFound` unless a job that the caller may see uses the capture `digest`."""
-    specs = ((job_id, context.jobs.spec(job_id)) for job_id in context.store.ids())
-    if not any(spec.capture == digest and caller.sees(job_id, spec) for job_id, spec in specs):
-        raise CaptureNotFound(digest)
 
 
 @router.get("", operation_id="list_jobs")

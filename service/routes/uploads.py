@@ -1,4 +1,7 @@
-"""Routes of resumable uploads: begin one, send its parts, look how far it is. `POST /jobs?capture=ID` uses it."""
+"""Routes of resumable uploads: begin one, send its parts, look how far it is.
+
+`POST /jobs`, `POST /plans` and `POST /captures` take its id as `capture`.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,9 @@ from pydantic import BaseModel, Field
 
 from service.access import CallerDep
 from service.context import MB, ContextDep
-from service.problems import RESPONSES, BadRequest, UploadConflict, UploadNotFound
+from service.problems import RESPONSES, BadRequest, UploadConflict
 from service.resumable import ResumableUpload
+from service.sent_capture import owned_upload
 
 router = APIRouter(prefix="/uploads", tags=["uploads"], responses=RESPONSES)
 
@@ -28,7 +32,7 @@ _PART: Final[dict[str, Any]] = {
 class UploadResource(BaseModel):
     """A resumable upload."""
 
-    id: str = Field(description="For `POST /jobs?capture=ID`, once all bytes are there.")
+    id: str = Field(description="For `capture` of `POST /jobs`, `/plans` and `/captures`, once all bytes are there.")
     bytes: int = Field(description="Size of the whole archive.")
     received: int = Field(description="Bytes received; the next part begins with the byte of this number.")
     expires_at: float = Field(description="Unix seconds. Every part that arrives puts it off by a day.")
@@ -46,10 +50,7 @@ def owned(
     upload_id: Annotated[str, Path(pattern="^[0-9a-f]{32}$", description="Id of an upload.")],
 ) -> ResumableUpload:
     """The upload, if it is one of the caller's. Raises `UploadNotFound`."""
-    upload = context.resumable.find(upload_id)
-    if not caller.owns(upload.owner):
-        raise UploadNotFound(upload_id)
-    return upload
+    return owned_upload(context, caller, upload_id)
 
 
 OwnedDep = Annotated[ResumableUpload, Depends(owned)]

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 import uvicorn
@@ -52,6 +53,33 @@ def test_parts_become_the_capture_that_the_whole_would_be(
     assert job["capture"] == hashlib.sha256(archive).hexdigest()
     assert client.post("/jobs", content=archive).json()["capture"] == job["capture"]
     assert [path.suffix for path in (settings.data / "resumable").iterdir()] == [".json"]
+    assert list((settings.data / "uploads").iterdir()) == []
+
+
+def found(client: TestClient, path: str, content: bytes | None = None) -> dict[str, Any]:
+    """Statistics of a capture as a route answers them, without the time they took."""
+    answer = client.post(path, content=content)
+    assert answer.status_code == 200, answer.text
+    return {**answer.json()["statistics"], "cost_s": None}
+
+
+@pytest.mark.parametrize("route", ["/captures", "/plans"])
+def test_a_capture_is_looked_at_before_a_job_is_made_of_it_and_after_without_sending_it_again(
+    client: TestClient, archive: bytes, settings: Settings, route: str
+) -> None:
+    whole = found(client, route, archive)
+    upload = begin(client, archive)
+    assert client.post(f"{route}?capture={upload}").status_code == 409
+    send(client, upload, archive, 0, len(archive))
+    assert found(client, f"{route}?capture={upload}") == whole
+    assert received(client, upload) == len(archive)
+    assert list((settings.data / "captures").iterdir()) == []
+    job = client.post(f"/jobs?capture={upload}").json()
+    for sent in (upload, job["capture"]):
+        assert found(client, f"{route}?capture={sent}") == whole
+    for unknown in ("0" * 32, "0" * 64):
+        assert client.post(f"{route}?capture={unknown}").status_code == 404
+    assert client.post(f"{route}?capture=x").status_code == 422
     assert list((settings.data / "uploads").iterdir()) == []
 
 
