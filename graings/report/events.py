@@ -235,17 +235,17 @@ class OpacityReset(_Event):
 
 
 class Restarted(_Event):
-    """A large moving object was missing in many views: training starts again on a part of the clip."""
+    """A moving object was missing: training starts again with tracks of it, or on a part of the clip."""
 
     kind: Literal["restart"] = Field("restart", description=KIND)
     missing_share: float = Field(ge=0, le=1, description="Share of the checked training views in which it was missing.")
-    time_window: float = Field(gt=0, lt=1, description="Share of the clip that the new start begins with.")
+    time_window: float = Field(gt=0, le=1, description="Share of the clip that the new start begins with.")
+    tracked_points: int = Field(0, ge=0, description="Points of the object whose way through the clip was found.")
 
     def _words(self) -> str:
-        return (
-            f"training starts again with the middle {100 * self.time_window:.3g} % of the clip: in "
-            f"{self.missing_share:.0%} of the views a large moving object was missing. `time_window=1` prevents this."
-        )
+        points, part = self.tracked_points, f"the middle {100 * self.time_window:.3g} % of the clip"
+        start = f"{points} points that follow what moves" if points else part
+        return f"training starts again with {start}: the model missed a moving object. `time_window=1` prevents this."
 
 
 class Stiff(_Event):

@@ -1,4 +1,4 @@
-"""The objective of one step (Eq. 14) for its views, with the two terms that are ours: squared error and alpha."""
+"""The objective of one step (Eq. 14) for its views, with the terms that are ours: squared error, alpha and tracks."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from graings.raster.result import RenderResult
 from graings.scene.scene import Composition, Scene
 from graings.training import losses
 from graings.training.regularisers import regularisers
+from graings.training.tracks.motion_tracks import MotionTracks
+from graings.training.tracks.track_loss import UNTIL, track_loss
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +40,18 @@ class Objective:
     """Computes the loss of steps on one capture. `times` are its distinct training times, ascending."""
 
     def __init__(
-        self, config: TrainConfig, images: ImageStore, times: NDArray[np.float64], streams: RandomStreams
+        self,
+        config: TrainConfig,
+        images: ImageStore,
+        times: NDArray[np.float64],
+        streams: RandomStreams,
+        tracks: MotionTracks | None = None,
     ) -> None:
         self.config = config
         self.images = images
         self.times = times
         self.streams = streams
+        self.tracks = tracks
 
     def __call__(
         self,
@@ -65,7 +73,7 @@ class Objective:
         )
         moments = [frame.time for frame in frames]
         total = self.regularisers(scene, compositions, moments) + differences.mean()
-        total = total + self._alpha_term(frames, results)
+        total = total + self._alpha_term(frames, results) + self._track_term(scene, moments, iteration)
         mse = tuple(_mse(r.color.detach(), t, v) for r, t, v in zip(results, targets, masks, strict=True))
         without_squared = total.detach() - squared * statistics.mean(mse)
         return StepLoss(total, without_squared, differences, mse)
@@ -78,6 +86,13 @@ class Objective:
         """Weight of the squared error: 0 while anchors grow, because growth would follow its large gradients."""
         config = self.config
         return config.loss.squared if iteration > config.scaled(config.density.grow_until) else 0.0
+
+    def _track_term(self, scene: Scene, moments: Sequence[float], iteration: int) -> Tensor:
+        """Difference of the deformation and the tracks, with a weight that falls linearly from 1 to 0."""
+        weight = 1 - iteration / max(1, self.config.scaled(UNTIL))
+        if self.tracks is None or weight <= 0:
+            return torch.zeros(())
+        return weight * track_loss(scene, self.tracks, moments)
 
     def _alpha_term(self, frames: Sequence[Frame], results: Sequence[RenderResult]) -> Tensor:
         """Difference of alpha over the views that have an alpha channel; a view without one contributes 0."""

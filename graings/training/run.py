@@ -17,7 +17,6 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import TrainConfig
 from graings.errors import CheckpointError, DivergedError
-from graings.evaluation.evaluate import subset
 from graings.kernel import computing_threads
 from graings.plan.capture_statistics import measure
 from graings.plan.cost import stored_calibration
@@ -34,12 +33,13 @@ from graings.storage.checkpoint import (
     newest_checkpoint,
 )
 from graings.storage.run_folder import RECORD_FILE, sole_trainer
-from graings.training.curriculum import missing_motion
+from graings.training.curriculum.missing_motion import MissingMotion, check_iteration
 from graings.training.curriculum.restart import RestartState
 from graings.training.density.unseen import drop_unseen
 from graings.training.plan_revision import PlanRevision
 from graings.training.run_output import RunOutput, RunReport, psnr_of_best
 from graings.training.timing import Clock, Rate, evaluation_marks
+from graings.training.tracks.motion_tracks import MotionTracks
 from graings.training.trainer import Trainer
 from graings.training.training_log import TrainingLog
 
@@ -129,12 +129,12 @@ class TrainingRun:
         run._best_psnr = psnr_of_best(folder, run._restart)
         return run
 
-    def _start(self, restart: RestartState) -> None:
+    def _start(self, restart: RestartState, tracks: MotionTracks | None = None) -> None:
         """A new scene, of the whole run or after a restart."""
         started, computed = time.perf_counter(), time.process_time()
         with computing_threads(self.threads):
             config = restart.config(self.applied)
-            self._trainer = Trainer.start(self.capture, self.images, config, restart.iterations_before)
+            self._trainer = Trainer.start(self.capture, self.images, config, restart.iterations_before, tracks)
         self._restart = restart
         self._best_psnr = None
         self.log.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
@@ -217,7 +217,7 @@ class TrainingRun:
         return events
 
     def _restart_if_motion_is_missing(self) -> tuple[Event, ...]:
-        """Once, after part of the steps: restart within a short part of the clip where a moving object is missing.
+        """Once, after part of the steps: restart with what helps to find a moving object that is missing.
 
         Training does not find an object later that it has missed by then. The restart takes as many iterations as
         the run was to have: with only the remaining ones a draft is 5 dB worse. A time window that was configured, or
@@ -225,22 +225,21 @@ class TrainingRun:
         """
         trainer, before = self._trainer, self._restart.iterations_before
         chosen = self.applied.time_window is not None or trainer.window.share(1) < 1
-        if self.iteration != missing_motion.check_iteration(self.applied) or before > 0 or chosen:
-            return ()
-        window = missing_motion.restart_window(self.applied, [frame.time for frame in self.capture.train])
-        if window is None or not trainer.scene.temporal:
+        if self.iteration != check_iteration(self.applied) or before > 0 or chosen or not trainer.scene.temporal:
             return ()
         started, computed = time.perf_counter(), time.process_time()
-        frames = subset(self.capture.train, missing_motion.VIEWS)
-        share = missing_motion.missing_fraction(trainer.scene, frames, self.images, trainer.background)
+        found = MissingMotion.find(trainer.scene, self.capture, self.images, self.applied)
         self.log.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
-        if share <= missing_motion.MAX_MISSING_FRACTION:
+        if found is None:
             return ()
-        iteration = self.iteration
-        self._start(RestartState(iteration, window))
-        events = (Restarted(iteration=iteration, missing_share=share, time_window=window),)
-        self.log.note(events)
-        return events
+        iteration, tracks = self.iteration, found.tracks
+        self._start(RestartState(iteration, found.time_window, tracks is not None), tracks)
+        count = 0 if tracks is None else len(tracks.points)
+        event = Restarted(
+            iteration=iteration, missing_share=found.share, time_window=found.time_window, tracked_points=count
+        )
+        self.log.note([event])
+        return (event,)
 
     def _save(self, **how: bool) -> Path:
         return self.output.save(self._trainer, self._restart, self.iteration, **how)

@@ -25,6 +25,7 @@ from graings.training.objective import Objective
 from graings.training.optimizer import Optimizer
 from graings.training.parameter_average import ParameterAverage
 from graings.training.tensor_groups import joined, split
+from graings.training.tracks.motion_tracks import MotionTracks
 from graings.training.view_batches import ViewBatches
 from graings.training.view_sampler import ViewSampler
 
@@ -33,13 +34,16 @@ State = TypeVar("State", bound="TrainerState")
 # Factor on the learning rates after each rollback.
 RATE_CUT: Final = 0.5
 
+# Groups of the tensors of a checkpoint beside the scene.
+GROUPS: Final = ("adam", "statistics", "streams", "sampler", "average", "guard", "tracks")
+
 
 class TrainerState:
     """A scene in training with its optimiser, random streams, schedules and guard.
 
     Make it with `start` or `resume`. `iterations_before` are those of a run before a restart: reports count them,
     `iteration` and the schedule of `config` do not. `time_window` is the share of the clip that training begins with,
-    `notes` are what initialization decided, for the first report.
+    `notes` are what initialization decided, for the first report. `tracks` are of what the run has missed before.
     """
 
     def __init__(
@@ -54,6 +58,7 @@ class TrainerState:
         time_window: float,
         notes: Sequence[PointsInitialized] = (),
         iterations_before: int = 0,
+        tracks: MotionTracks | None = None,
     ) -> None:
         self.capture = capture
         self.images = images
@@ -64,18 +69,24 @@ class TrainerState:
         self.iteration = 0
         self.background = config.capture.background_rgb()
         self.phases = phases(config)
-        self.objective = Objective(config, images, capture.times, streams)
+        self.tracks = tracks
+        self.objective = Objective(config, images, capture.times, streams, tracks)
         self.window = TimeWindow(config, [frame.time for frame in capture.train], time_window)
         self.snapshots = Snapshots()
         self._attach(scene, voxel_size)
 
     @classmethod
     def start(
-        cls: type[State], capture: Capture, images: ImageStore, config: TrainConfig, iterations_before: int = 0
+        cls: type[State],
+        capture: Capture,
+        images: ImageStore,
+        config: TrainConfig,
+        iterations_before: int = 0,
+        tracks: MotionTracks | None = None,
     ) -> State:
         """A trainer of a new scene. Raises `CaptureError` where no image shows anything."""
         streams = RandomStreams(config.seed)
-        initial = make_scene(capture, images, config, streams)
+        initial = make_scene(capture, images, config, streams, tracks)
         return cls(
             capture,
             images,
@@ -86,6 +97,7 @@ class TrainerState:
             time_window=initial.time_window,
             notes=initial.notes,
             iterations_before=iterations_before,
+            tracks=tracks,
         )
 
     @classmethod
@@ -110,6 +122,7 @@ class TrainerState:
             time_window=float(facts["time_window"]),
             notes=[PointsInitialized.model_validate(note) for note in facts["notes"]],
             iterations_before=iterations_before,
+            tracks=MotionTracks.of_tensors(split(tensors, GROUPS)["tracks"]),
         )
         trainer.load(scene, tensors, facts)
         return trainer
@@ -176,6 +189,7 @@ class TrainerState:
                 "sampler": {"remaining": self.views.sampler.remaining},
                 "average": means,
                 "guard": norms,
+                "tracks": {} if self.tracks is None else self.tracks.tensors(),
             }
         )
         facts = {
@@ -195,7 +209,7 @@ class TrainerState:
     def load(self, scene: Scene, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
         """Continue from a scene and what `state()` returned with it."""
         self._attach(scene, float(facts["voxel_size"]))
-        parts = split(tensors, ("adam", "statistics", "streams", "sampler", "average", "guard"))
+        parts = split(tensors, GROUPS)
         self.optimizer.load(parts["adam"])
         self.density.load(parts["statistics"], facts)
         self.streams.load(parts["streams"])

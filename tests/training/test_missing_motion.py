@@ -1,4 +1,4 @@
-"""Training that has missed an object with large motion restarts with a part of the clip."""
+"""Training that has missed an object with large motion restarts with tracks of it, or with a part of the clip."""
 
 from __future__ import annotations
 
@@ -15,16 +15,8 @@ import torch
 from graings.capture.synthetic import Body, SyntheticScene, write_synthetic
 from graings.config import TrainConfig, make_config
 from graings.storage.checkpoint import load_model, load_state, newest_checkpoint
-from graings.training.curriculum.missing_motion import (
-    BLOCK,
-    CELLS,
-    CHECK_AT,
-    COLOR_DIFFERENCE,
-    MIN_STEPS,
-    RESTART_WINDOWS,
-    has_missing_object,
-    restart_window,
-)
+from graings.training.curriculum.missing_motion import CHECK_AT, MIN_STEPS, RESTART_WINDOWS, restart_window
+from graings.training.curriculum.missing_object import BLOCK, CELLS, COLOR_DIFFERENCE, has_missing_object
 from graings.training.curriculum.restart import RestartState
 from graings.training.run import TrainingRun
 from graings.training.run_output import RunReport
@@ -75,9 +67,34 @@ def again(reports: list[RunReport]) -> list[int]:
     return [r.iteration for r in reports for event in r.events if event.kind == "restart"]
 
 
-def test_a_missing_ball_restarts_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+# Without DeformNet tracks have nothing to teach.
+UNTRACKED = {"scene.single_mlp": True}
+
+
+def test_a_missing_ball_restarts_training_with_tracks_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
-    config = small(**{"evaluation.first": 27, "evaluation.factor": 2.0})
+    run = TrainingRun.create(capture, tmp_path / "run", small())
+    reports = train(run, LATER)
+    (restart,) = [event for r in reports for event in r.events if event.kind == "restart"]
+    assert (restart.iteration, restart.time_window) == (MIN_STEPS, 1.0)
+    assert "points that follow what moves" in restart.message
+    tracks = run.trainer.tracks
+    assert tracks is not None
+    assert restart.tracked_points == len(tracks.points)
+    # The ball swings along x by 0.8, farthest back at the middle of the clip; its height stays.
+    swing = tracks.positions.mean(1) / run.capture.units.scale
+    assert swing[:, 0].max() - swing[:, 0].min() > 1.3
+    assert swing[:, 1:].abs().max() < 0.3
+    assert {r.phase for r in reports[MIN_STEPS:]} == {"joint"}
+    facts = load_state(newest_checkpoint(run.folder) or Path()).facts
+    assert facts["restart"] == {"iterations_before": MIN_STEPS, "time_window": 1.0, "tracked": True}
+
+
+def test_a_missing_ball_without_tracks_restarts_training_with_part_of_the_clip(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = write_floored(tmp_path / "c", monkeypatch)
+    config = small(**UNTRACKED, **{"evaluation.first": 27, "evaluation.factor": 2.0})
     run = TrainingRun.create(capture, tmp_path / "run", config)
     reports = train(run, LATER)
     assert again(reports) == [MIN_STEPS]
@@ -87,7 +104,11 @@ def test_a_missing_ball_restarts_training(tmp_path: Path, monkeypatch: pytest.Mo
     # The new attempt is a whole training, warmed up once more in the middle of the clip.
     assert [b.iteration for a, b in pairwise(reports) if (a.phase, b.phase) == ("joint", "warmup")] == [MIN_STEPS + 1]
     facts = load_state(newest_checkpoint(run.folder) or Path()).facts
-    assert facts["restart"] == {"iterations_before": MIN_STEPS, "time_window": RESTART_WINDOWS[-1]}
+    assert facts["restart"] == {
+        "iterations_before": MIN_STEPS,
+        "time_window": RESTART_WINDOWS[-1],
+        "tracked": False,
+    }
     assert (run.iteration, facts["trainer"]["iteration"]) == (LATER, LATER - MIN_STEPS)
     assert [e.share for r in reports for e in r.events if e.kind == "time_window"] == [0.25]
     assert [point["iteration"] for point in facts["curve"]] == [27, 54, 108, 216, 432]
@@ -97,14 +118,15 @@ def test_a_missing_ball_restarts_training(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow(reason="1,000 steps; test_run has resuming to the bit without a new attempt")
+@pytest.mark.parametrize("options", [{}, UNTRACKED], ids=["tracks", "window"])
 def test_interrupted_before_and_after_a_restart_it_equals_the_unbroken_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
 ) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
-    unbroken = TrainingRun.create(capture, tmp_path / "unbroken", small())
+    unbroken = TrainingRun.create(capture, tmp_path / "unbroken", small(**options))
     train(unbroken, LATER)
     broken = tmp_path / "broken"
-    train(TrainingRun.create(capture, broken, small()), MIN_STEPS - 10)
+    train(TrainingRun.create(capture, broken, small(**options)), MIN_STEPS - 10)
     found = []
     for stop in (MIN_STEPS, MIN_STEPS + 30, LATER):
         found += again(train(TrainingRun.resume(broken, threads=1), stop))
@@ -134,7 +156,7 @@ def test_too_few_views_do_not_restart(tmp_path: Path, monkeypatch: pytest.Monkey
     document = json.loads(path.read_text())
     document["frames"] = document["frames"][::2]  # 24, of which fewer than eight lie in a quarter of the clip
     path.write_text(json.dumps(document))
-    assert again(train(TrainingRun.create(capture, tmp_path / "run", small()), MIN_STEPS + 2)) == []
+    assert again(train(TrainingRun.create(capture, tmp_path / "run", small(**UNTRACKED)), MIN_STEPS + 2)) == []
 
 
 @pytest.mark.slow(reason="430 steps with many anchors")
@@ -158,9 +180,9 @@ def test_an_object_is_missing_where_a_whole_block_has_another_colour() -> None:
     ):
         drawn = shown.clone()
         drawn[rows, columns.start : columns.stop - wide, 1] += change
-        assert has_missing_object(drawn, shown) == missing
-    assert not has_missing_object(shown, shown)
-    assert not has_missing_object(torch.zeros(2, 90, 3), torch.ones(2, 90, 3))  # too flat for a block
+        assert has_missing_object(drawn - shown) == missing
+    assert not has_missing_object(torch.zeros_like(shown))
+    assert not has_missing_object(torch.ones(2, 90, 3))  # too flat for a block
 
 
 def test_a_restart_has_its_own_time_window() -> None:

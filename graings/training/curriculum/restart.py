@@ -14,12 +14,17 @@ from graings.config import TrainConfig
 class RestartState:
     """`iterations_before` the restart were spent in addition to those of the configuration; 0 for a run without one.
 
-    `time_window`, if not None, replaces the configuration's.
+    `time_window`, if not None, replaces the configuration's. With tracks (`tracked`) there is no static warm-up: in it
+    what moves would become transparent.
     """
 
     iterations_before: int = 0
     time_window: float | None = None
+    tracked: bool = False
 
     def config(self, config: TrainConfig) -> TrainConfig:
-        """`config` with the time window of the restart."""
-        return config if self.time_window is None else config.model_copy(update={"time_window": self.time_window})
+        """`config` with the time window of the restart, and its warm-up."""
+        if self.time_window is None:
+            return config
+        warmup = 0 if self.tracked else config.warmup
+        return config.model_copy(update={"time_window": self.time_window, "warmup": warmup})

@@ -39,6 +39,7 @@ from graings.training.initialization.visual_hull import (
     not_masked,
     visual_hull,
 )
+from graings.training.tracks.motion_tracks import MotionTracks
 
 FEATURE_STD = 0.1
 
@@ -74,11 +75,22 @@ class InitialPoints:
     notes: tuple[PointsInitialized, ...] = ()
 
 
-def make_scene(capture: Capture, images: ImageStore, config: TrainConfig, streams: RandomStreams) -> InitialScene:
-    """A scene of the first anchors. Raises `CaptureError` where no image shows anything."""
+def make_scene(
+    capture: Capture,
+    images: ImageStore,
+    config: TrainConfig,
+    streams: RandomStreams,
+    tracks: MotionTracks | None = None,
+) -> InitialScene:
+    """A scene of the first anchors, on the points of `tracks` too.
+
+    Raises `CaptureError` where no image shows anything.
+    """
     first = initial_points(capture, images, config, streams)
     cameras = [frame.camera for frame in capture.train]
     places = torch.from_numpy(first.positions)
+    if tracks is not None:
+        places = torch.cat([places, tracks.points.double()])
     voxel = config.init.voxel_size or VOXEL_PER_PIXEL / SamplingRate.of(cameras, content_extent(places)).reference
     anchors = torch.unique(voxel_keys(places, voxel), dim=0).double() * voxel
     extent = content_extent(anchors)  # of anchors, not points: dense parts of a cloud must not dominate

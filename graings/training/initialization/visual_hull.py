@@ -76,7 +76,7 @@ def not_masked(points: NDArray[np.float64], frames: Sequence[Frame], images: Ima
         return points
     seen, shown = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for frame in frames:
-        columns, rows, inside = _whole_pixels(points, frame.camera)
+        columns, rows, inside = whole_pixels(points, frame.camera)
         valid = images.valid(frame)
         seen += inside
         shown += inside if valid is None else inside & valid[rows, columns]
@@ -122,8 +122,8 @@ def _mask_fractions(points: NDArray[np.float64], views: Sequence[MaskedFrame]) -
     """For each point, the share of the views that see it in whose dilated mask it lies; -1 where no view does."""
     votes, seen = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for view in views:
-        columns, rows, inside = _whole_pixels(points, view.frame.camera)
-        mask = _dilated(view.mask, MASK_MARGIN)
+        columns, rows, inside = whole_pixels(points, view.frame.camera)
+        mask = dilated(view.mask, MASK_MARGIN)
         if view.valid is not None:
             inside &= view.valid[rows, columns]
         seen += inside
@@ -166,7 +166,7 @@ class _Cells:
         """With `cells` cells along the longer image side."""
         camera = view.frame.camera
         size = max(1, -(-max(camera.width, camera.height) // cells))
-        columns, rows, inside = _whole_pixels(points, camera)
+        columns, rows, inside = whole_pixels(points, camera)
         down, across = np.arange(0, camera.height, size), np.arange(0, camera.width, size)
         mask_pixels = np.add.reduceat(np.add.reduceat(view.mask, down, axis=0, dtype=np.int64), across, axis=1)
         cell = (rows // size * len(across) + columns // size).astype(
@@ -178,7 +178,7 @@ class _Cells:
         """Cells, [H, W], with one of the `chosen` points in them or in a neighbour."""
         near = np.zeros(self.mask_pixels.size, np.bool_)
         near[self.cell[self.inside & chosen]] = True
-        return _dilated(near.reshape(self.mask_pixels.shape), 1)
+        return dilated(near.reshape(self.mask_pixels.shape), 1)
 
     def at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Points that project into one of the `cells`, [H, W]."""
@@ -186,7 +186,7 @@ class _Cells:
         return found
 
 
-def _whole_pixels(
+def whole_pixels(
     points: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Pixel column and row of each point, and whether it is in front of the camera and inside the image."""
@@ -198,7 +198,7 @@ def _whole_pixels(
     return columns, rows, inside
 
 
-def _dilated(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
+def dilated(mask: NDArray[np.bool_], margin: int) -> NDArray[np.bool_]:
     values = torch.from_numpy(mask).float()[None, None]
     grown: NDArray[np.bool_] = (
         torch.nn.functional.max_pool2d(values, 2 * margin + 1, stride=1, padding=margin)[0, 0].numpy() > 0
