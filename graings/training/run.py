@@ -220,17 +220,17 @@ class TrainingRun:
         """Once, after part of the steps: restart with what helps to find a moving object that is missing.
 
         Training does not find an object later that it has missed by then. The restart takes as many iterations as
-        the run was to have: with only the remaining ones a draft is 5 dB worse. A time window that was configured, or
-        chosen from the masks, stays.
+        the run was to have: with only the remaining ones a draft is 5 dB worse. A time window that was configured
+        stays; one that was chosen from the masks gives way to tracks, but not to another window.
         """
-        trainer, before = self._trainer, self._restart.iterations_before
-        chosen = self.applied.time_window is not None or trainer.window.share(1) < 1
-        if self.iteration != check_iteration(self.applied) or before > 0 or chosen or not trainer.scene.temporal:
+        trainer, before, configured = self._trainer, self._restart.iterations_before, self.applied.time_window
+        due = self.iteration == check_iteration(self.applied) and before == 0
+        if not due or configured is not None or not trainer.scene.temporal:
             return ()
         started, computed = time.perf_counter(), time.process_time()
         found = MissingMotion.find(trainer.scene, self.capture, self.images, self.applied)
         self.log.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
-        if found is None:
+        if found is None or (found.tracks is None and trainer.window.share(1) < 1):
             return ()
         iteration, tracks = self.iteration, found.tracks
         self._start(RestartState(iteration, found.time_window, tracks is not None), tracks)
