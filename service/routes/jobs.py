@@ -64,7 +64,7 @@ async def submit(
         spec = JobSpec(title, sent.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
         folder = None if sent.stored else sent.folder
         job = await to_thread.run_sync(context.jobs.submit, spec, folder, idempotency_key)
-        if sent.upload is not None:
+        if sent.upload is not None and not sent.stored:  # once: another job does not put off its expiry
             await to_thread.run_sync(sent.upload.write, sent.digest)
     return _accepted(job, response)
 

@@ -89,7 +89,9 @@ def test_a_request_for_a_job_may_be_sent_again(client: TestClient, archive: byte
     headers = {"Idempotency-Key": "one"}
     first, second = (client.post(f"/jobs?capture={upload}", headers=headers).json()["id"] for _ in range(2))
     assert first == second
+    before = client.get(f"/uploads/{upload}").json()["expires_at"]
     assert client.post(f"/jobs?capture={upload}").json()["id"] != first
+    assert client.get(f"/uploads/{upload}").json()["expires_at"] == before
     for job in client.get("/jobs").json()["jobs"]:
         client.delete(f"/jobs/{job['id']}")
     gone = client.post(f"/jobs?capture={upload}")
