@@ -40,7 +40,13 @@ class ResumableUpload:
 
     @property
     def received(self) -> int:
-        return self.size if self.capture else self.archive.stat().st_size
+        """Number of bytes. Raises `UploadNotFound` where they expired, or a job is just made of them."""
+        if self.capture:
+            return self.size
+        try:
+            return self.archive.stat().st_size
+        except FileNotFoundError as error:
+            raise UploadNotFound(self.path.name) from error
 
     @property
     def expires_at(self) -> float:

@@ -24,7 +24,7 @@ from graings.capture.synthetic import RECIPE_FILE, SceneRecipe
 from graings.footage.source import video_suffix
 from jobs.leftovers import discard_leftovers
 from service.archives import Limits, unpack
-from service.problems import BadRequest
+from service.problems import BadRequest, UploadConflict
 
 _CHUNK = 1 << 20
 
@@ -74,7 +74,8 @@ async def receive_capture(
 ) -> AsyncIterator[Upload]:
     """The capture in the body of a request, which is an archive or a multipart form with one, or in `received`.
 
-    `folder` is removed with the context unless it was moved. Raises `ArchiveError` and `BadRequest`.
+    `folder` is removed with the context unless it was moved. Raises `ArchiveError`, `BadRequest`, and `UploadConflict`
+    where `received` is gone.
     """
     # Not only at the start of the service: files of a process that died may fill the disk that this upload needs.
     await to_thread.run_sync(discard_leftovers, uploads)
@@ -82,7 +83,10 @@ async def receive_capture(
     archive, folder = uploads / f"{name}.part", uploads / name
     try:
         if received is not None:
-            os.link(received, archive)
+            try:
+                os.link(received, archive)
+            except FileNotFoundError as error:
+                raise UploadConflict("Another request just made a job of this upload. Send this one again.") from error
             config, digest = {}, await to_thread.run_sync(_digest, archive)
         elif request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
             async with request.form(max_files=1, max_fields=1) as form:

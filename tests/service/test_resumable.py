@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,27 @@ def test_a_request_for_a_job_may_be_sent_again(client: TestClient, archive: byte
         client.delete(f"/jobs/{job['id']}")
     gone = client.post(f"/jobs?capture={upload}")
     assert (gone.status_code, gone.json()["type"]) == (404, "urn:graings:problem:no-such-capture")
+
+
+def test_an_upload_whose_bytes_are_gone_is_not_found(client: TestClient, archive: bytes, settings: Settings) -> None:
+    """They expire, and another request for a job takes them."""
+    upload = begin(client, archive)
+    send(client, upload, archive, 0, len(archive))
+    (settings.data / "resumable" / f"{upload}.part").unlink()
+    for path in (f"/jobs?capture={upload}", f"/plans?capture={upload}", f"/captures?capture={upload}"):
+        assert client.post(path).status_code == 404
+    assert client.get(f"/uploads/{upload}").status_code == 404
+
+
+def test_requests_at_once_for_jobs_of_one_upload_are_answered(client: TestClient, archive: bytes) -> None:
+    upload = begin(client, archive)
+    send(client, upload, archive, 0, len(archive))
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(lambda _: client.post(f"/jobs?capture={upload}&preset=draft"), range(4)))
+    codes = {answer.status_code for answer in answers}
+    assert 202 in codes
+    assert codes <= {202, 404, 409}  # nothing but what a client may send again
+    assert client.post(f"/jobs?capture={upload}").status_code == 202
 
 
 def test_an_upload_that_is_no_capture_stays_until_it_is_deleted(client: TestClient, settings: Settings) -> None:
