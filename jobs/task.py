@@ -50,16 +50,16 @@ class VideoSpec(Document):
     kind: Literal["video"] = "video"
     format: VideoFormat = Field("mp4", description="Container: H.264, VP9, or an animated picture.")
     moves: Moves = Field("both", description="time, at a fixed camera; camera, at the time t; or both.")
-    path: Literal["orbit", "views"] | dict[str, Any] = Field(
-        "orbit",
+    path: Literal["orbit", "views"] | dict[str, Any] | None = Field(
+        None,
         description="Of the camera: orbit, once around; views, a spline through training views; or an object with keys "
-        "or nerfstudio's camera_path (docs/export.md).",
+        "or nerfstudio's camera_path (docs/export.md). Default: orbit, or views if all training views are on one side.",
     )
     seconds: float = Field(4.0, gt=0, le=600, description="Length.")
     fps: float = Field(30.0, gt=0, le=240, description="Frames per second.")
     t: float | None = Field(None, ge=0, le=1, description="Time while only the camera moves (default: 0).")
     camera: str | None = Field(None, max_length=40, description="A view of the capture: train:0, val:3, test:12.")
-    azimuth: float | None = Field(None, description="Orbit: degrees about the vertical at the start (default 0).")
+    azimuth: float | None = Field(None, description="Orbit: degrees about the vertical at the start.")
     elevation: float | None = Field(None, ge=-90, le=90, description="Orbit: degrees above the horizon.")
     radius: float | None = Field(None, gt=0, description="Orbit: distance from target, capture units.")
     target: tuple[float, float, float] | None = Field(None, description="Orbit: x, y, z in capture units.")

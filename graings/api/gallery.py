@@ -93,7 +93,7 @@ def _count(observe: Callable[[int, int], None], before: int, total: int, done: i
 
 def _item(run: Path, name: str, metrics: Metrics, folder: Path, observe: Callable[[int], None]) -> str:
     scene = open_scene(run)
-    view: dict[str, Any] = {"width": SIDE, "height": SIDE, "azimuth": 30.0}
+    view: dict[str, Any] = {"width": SIDE, "height": SIDE}
     save_image(folder / f"{name}.png", render_view(scene, t=0.5, **view))
     clip = folder / f"{name}.webp"
     render_video(scene, clip, seconds=SECONDS, fps=FPS, observe=observe, **view)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from graings.api.training import FilePath
 from graings.camera.view_request import ViewRequest
-from graings.export.camera_path import ORBIT, Moves, frames_of
+from graings.export.camera_path import Moves, frames_of
 from graings.export.export import FRAMES
 from graings.export.selection import Selection
 from graings.export.shown import Shown, open_shown
@@ -57,14 +57,15 @@ def render_video(
     seconds: float = 4.0,
     fps: float = 30.0,
     moves: Moves = "both",
-    along: str = ORBIT,
+    along: str | None = None,
     observe: Callable[[int], None] = lambda done: None,
     **view: Any,
 ) -> None:
     """Write a video: .mp4, .webm, .webp, .gif, or without suffix a folder of PNG files.
 
     `moves`: "time", "camera" or "both". `along`: "orbit", "views" (a spline through training views), or the name of a
-    file with a camera path. `view`: as for `render_view`. Raises `ValueError`, and `CheckpointError` for the file.
+    file with a camera path; None is "orbit", or "views" if all training views are on one side. `view`: as for
+    `render_view`. Raises `ValueError`, and `CheckpointError` for the file.
     """
     path, request = Path(path), _request(view)
     check_video(path)

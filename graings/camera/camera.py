@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from graings.camera.orbit import horizon
+
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
 _MIN_DEPTH = 1e-9  # smaller depths are replaced by this one when arbitrary points are projected
@@ -128,11 +130,7 @@ class Camera:
         height: int,
     ) -> Camera:
         """A camera on a sphere around `target`; angles in degrees, azimuth about `up`, elevation from the horizon."""
-        axis = np.asarray(up, dtype=np.float64)
-        axis = axis / np.linalg.norm(axis)
-        east = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-        east = east / np.linalg.norm(east)
-        north = np.cross(axis, east)
+        axis, east, north = horizon(up)
         a, e = math.radians(azimuth), math.radians(elevation)
         offset = math.cos(e) * (math.cos(a) * east + math.sin(a) * north) + math.sin(e) * axis
         eye = np.asarray(target, dtype=np.float64) + radius * offset

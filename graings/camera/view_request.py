@@ -51,6 +51,11 @@ class ViewRequest:
         """Whether neither a named view nor a pose is given."""
         return self.camera is None and self.pose is None
 
+    @property
+    def has_viewpoint(self) -> bool:
+        """Whether a named view, a pose or a value of an orbit is given."""
+        return any(getattr(self, name) is not None for name in ("camera", "pose", *ORBIT))
+
     def resolve(
         self, views: Mapping[str, Sequence[View]], units: Units, background: Color
     ) -> tuple[Camera, float, Color]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from graings.camera.camera import Camera, Vector, View
+from graings.camera.orbit import elevations, one_side
 from graings.camera.units import Units
 
 # Bounds of an orbit's radius in normalised units; beyond them rounding makes the camera's position meaningless.
@@ -33,8 +34,9 @@ def orbit_view(
     """A camera on a sphere around `target`, looking at it.
 
     `azimuth` is about the capture's vertical axis, `elevation` above the horizon, both in degrees; `radius` and
-    `target` [3] are in capture units, `fov` is the full horizontal angle in degrees. Defaults: azimuth 0, the median
-    radius and elevation of `model_views`, the scene's centre, and the field of view and size of the first view.
+    `target` [3] are in capture units, `fov` is the full horizontal angle in degrees. Defaults: the side where the
+    cameras of `model_views` stand, or azimuth 0 if they stand all around; their median radius and elevation; the
+    scene's centre; the field of view and size of the first view.
     Raises `ValueError` naming the parameter.
     """
     if not model_views:
@@ -51,10 +53,9 @@ def orbit_view(
     if radius is None:
         radius = float(np.median(lengths)) / units.scale
     if elevation is None:
-        # A camera exactly at the target has no elevation; it counts as 0 degrees.
-        sines = arms @ up / np.where(lengths > 0, lengths, 1.0)
-        elevation = math.degrees(float(np.median(np.arcsin(np.clip(sines, -1.0, 1.0)))))
-    azimuth = 0.0 if azimuth is None else azimuth
+        elevation = float(np.median(elevations(arms, up)))
+    if azimuth is None:
+        azimuth = one_side(arms, up) or 0.0
     first = model_views[0].camera
     fov = math.degrees(first.horizontal_fov) if fov is None else fov
     for name, value in (("azimuth", azimuth), ("elevation", elevation), ("radius", radius), ("fov", fov)):

@@ -33,7 +33,9 @@ def render_view(
     output: Annotated[Path, typer.Option("--output", "-o", help="Image file: .png, .jpg, .webp or .exr.")],
     t: Annotated[float | None, typer.Option(help="Time from 0 to 1 (default: that of --camera, or 0).")] = None,
     camera: Annotated[str | None, typer.Option(help="A view of the capture, such as test:3.")] = None,
-    azimuth: Annotated[float | None, typer.Option(help="Degrees about the vertical axis (default: 0).")] = None,
+    azimuth: Annotated[
+        float | None, typer.Option(help="Degrees about the vertical axis (default: the side of the training views).")
+    ] = None,
     elevation: Annotated[
         float | None, typer.Option(help="Degrees above the horizon (default: median of the training views).")
     ] = None,

@@ -12,7 +12,7 @@ from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.cli.rendering import RenderPath
 from graings.cli.terminal import print_line, task_progress
 from graings.cli.training import Threads
-from graings.export.camera_path import ORBIT, Moves, frames_of
+from graings.export.camera_path import Moves, frames_of
 from graings.export.shown import UP, open_shown
 from graings.export.video import check_video, write_video
 from graings.kernel import use_threads
@@ -25,12 +25,12 @@ def video(
     ],
     moves: Annotated[Moves, typer.Option(help="time, at a fixed camera; camera, at the time --t; or both.")] = "both",
     path: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="orbit: once around; views: a spline through training views; or a file: JSON of keys, or nerfstudio's "
-            "camera_path.json."
+            "camera_path.json (default: orbit, or views if all training views are on one side)."
         ),
-    ] = ORBIT,
+    ] = None,
     seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="Length.")] = 4.0,
     fps: Annotated[float, typer.Option(min=0.1, max=240, help="Frames per second.")] = 30.0,
     t: Annotated[float | None, typer.Option(help="Time from 0 to 1 while only the camera moves (default: 0).")] = None,

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graings.camera.camera import Camera, View
+from graings.camera.orbit import azimuths, one_side
 from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.camera.viewpoint import sized
 from graings.errors import CheckpointError
@@ -39,17 +40,20 @@ class PathKey:
 
 
 def frames_of(
-    shown: Shown, request: ViewRequest, path: str | Mapping[str, Any], moves: Moves, count: int
+    shown: Shown, request: ViewRequest, path: str | Mapping[str, Any] | None, moves: Moves, count: int
 ) -> list[tuple[Camera, float]]:
     """Camera and time in [0, 1] of `count` frames.
 
     `path` is `orbit`, once around from the view of `request`, `views`, a closed spline through training views, the name
-    of a file, or what such a file holds. What does not move stays as in `request`: the camera if `moves` is `time`, the
-    time if it is `camera`. The frames of a nerfstudio file are used as they are, whatever `count` is. Raises
-    `ValueError` for parameters out of range, `CheckpointError` for a file that cannot be used.
+    of a file, or what such a file holds. None stands for `orbit`, but for `views` if `request` names no viewpoint and
+    all training views are on one side of the scene. What does not move stays as in `request`: the camera if `moves` is
+    `time`, the time if it is `camera`. The frames of a nerfstudio file are used as they are, whatever `count` is.
+    Raises `ValueError` for parameters out of range, `CheckpointError` for a file that cannot be used.
     """
     if count < 1:
         raise ValueError(f"a video needs at least one frame, got {count}")
+    if path is None:
+        path = ORBIT if request.has_viewpoint or _side(shown) is None else VIEWS
     first, time, _ = request.resolve(shown.views, shown.units, shown.background)
     if moves == "time":
         cameras: list[PathKey] = [PathKey(first, None)] * count
@@ -58,7 +62,8 @@ def frames_of(
             raise ValueError(
                 "an orbit starts at azimuth, elevation and radius; leave out camera and pose, or name a path"
             )
-        start = request.azimuth or 0.0
+        target = shown.units.center if request.target is None else request.target
+        start = float(azimuths(first.center - shown.units.points(target), shown.units.up))
         turned = (replace(request, azimuth=start + 360.0 * index / count) for index in range(count))
         cameras = [PathKey(one.resolve(shown.views, shown.units, shown.background)[0], None) for one in turned]
     elif path == VIEWS:
@@ -76,15 +81,22 @@ def frames_of(
     return frames
 
 
+def _side(shown: Shown) -> float | None:
+    """Mean azimuth in degrees of the training views about the scene's centre if they are on one side of it."""
+    return one_side(np.stack([view.camera.center for view in shown.views["train"]]), shown.units.up)
+
+
 def around(shown: Shown) -> list[View]:
-    """Up to `KEYS` training views in the order of their azimuth about the vertical."""
-    up = np.asarray(shown.units.up)
-    side = np.eye(3)[int(np.argmin(np.abs(up)))]
-    x = side - up * (side @ up)
-    y = np.cross(up, x)
-    views = sorted(shown.views["train"], key=lambda view: math.atan2(view.camera.center @ y, view.camera.center @ x))
+    """Up to `KEYS` training views in the order of their azimuth, and back again if they are on one side."""
+    middle = _side(shown)
+
+    def place(view: View) -> float:
+        return math.remainder(float(azimuths(view.camera.center, shown.units.up)) - (middle or 0.0), 360.0)
+
+    views = sorted(shown.views["train"], key=place)
     kept = min(KEYS, len(views))
-    return [views[index * len(views) // kept] for index in range(kept)]
+    chosen = [views[index * len(views) // kept] for index in range(kept)]
+    return chosen if middle is None else chosen + chosen[-2:0:-1]
 
 
 def spline(keys: Sequence[PathKey], count: int, *, closed: bool = False) -> list[PathKey]:

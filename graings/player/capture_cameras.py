@@ -11,14 +11,13 @@ from graings.export.harmonics_fit import spread
 from graings.player.scene import CameraFacts, CaptureCameras, UnitsFacts
 from graings.storage.model import Model
 
-START_AZIMUTH: Final = 30.0  # degrees
 MOST: Final = {"train": 60, "val": 20}  # cameras of each split
 
 
 def capture_cameras(model: Model) -> CaptureCameras:
     """Units, background and cameras of the capture, and the view that a player begins with."""
     units = model.units
-    start = orbit_view(model.views["train"], units, START_AZIMUTH, None, None, None, None, None, None)
+    start = orbit_view(model.views["train"], units)
     return CaptureCameras(
         units=UnitsFacts(
             center=units.center,

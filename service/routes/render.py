@@ -18,6 +18,7 @@ from werkzeug.http import parse_accept_header
 
 import graings
 from graings.camera.camera import Camera
+from graings.camera.orbit import azimuths, elevations
 from graings.camera.units import Units
 from graings.camera.view_request import MAX_SIDE, ViewRequest
 from graings.errors import CheckpointError
@@ -75,7 +76,9 @@ class RenderQuery(BaseModel):
         None, description="Time in [0, 1], clamped. Default: that of the view named by `camera`, else 0."
     )
     camera: str | None = Field(None, max_length=40, description="A view of the capture: train:0, val:3, test:12.")
-    azimuth: float | None = Field(None, description="Orbit: degrees about the vertical (default 0).")
+    azimuth: float | None = Field(
+        None, description="Orbit: degrees about the vertical (default: the side of the training views)."
+    )
     elevation: float | None = Field(
         None, ge=-90, le=90, description="Orbit: degrees from the horizon (default: median)."
     )
@@ -225,9 +228,8 @@ def _orbit_header(view: ViewRequest, camera: Camera, units: Units) -> str:
     """Azimuth, elevation and radius of an orbit, so that a client that gave none can change them."""
     target = units.center if view.target is None else view.target
     arm = camera.center - units.points(target)
-    length = float(np.linalg.norm(arm))
-    elevation = math.degrees(math.asin(max(-1.0, min(1.0, float(arm @ np.asarray(units.up)) / length))))
-    return f"{view.azimuth or 0.0:g} {elevation:.6g} {length / units.scale:.6g}"
+    azimuth = azimuths(arm, units.up) if view.azimuth is None else view.azimuth
+    return f"{azimuth:.6g} {elevations(arm, units.up):.6g} {np.linalg.norm(arm) / units.scale:.6g}"
 
 
 def _numbers(text: str, name: str, count: int) -> list[float]:

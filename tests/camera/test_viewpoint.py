@@ -28,6 +28,16 @@ def test_orbit_takes_radius_elevation_angle_and_size_from_the_training_views() -
     assert (camera.width, camera.height) == (40, 30)
 
 
+@pytest.mark.parametrize(("angles", "azimuth"), [((100.0, 110.0, 150.0), 119.4), ((0.0, 120.0, 240.0), 0.0)])
+def test_an_orbit_begins_on_the_side_of_the_training_views_if_they_have_one(
+    angles: tuple[float, ...], azimuth: float
+) -> None:
+    cameras = [Camera.orbit(angle, 20.0, 1.5, fov=0.7, width=40, height=30) for angle in angles]
+    camera = orbit_view([View("v", camera, 0.0) for camera in cameras], UNITS)
+    expected = Camera.orbit(azimuth, 20.0, 1.5, fov=0.7, width=40, height=30)
+    np.testing.assert_allclose(camera.center, expected.center, atol=0.01)
+
+
 def test_orbit_reads_radius_and_target_in_the_captures_units() -> None:
     target = np.array([2.0, 0.0, 1.0])
     camera = orbit_view(ring((0.0,), 1.0), UNITS, azimuth=30.0, elevation=25.0, radius=8.0, target=target, fov=50.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from graings.camera.camera import Camera
+from graings.camera.camera import Camera, View
+from graings.camera.orbit import azimuths
 from graings.camera.view_request import ViewRequest
 from graings.errors import CheckpointError
 from graings.export.camera_path import PathKey, frames_of, spline
@@ -52,6 +54,39 @@ def test_a_path_through_views_is_smooth_closed_and_looks_at_the_scene() -> None:
     for camera, _ in frames:
         toward = -camera.center / np.linalg.norm(camera.center)
         assert camera.forward @ toward > math.cos(math.radians(25))
+
+
+def one_sided(middle: float) -> Shown:
+    """Training views over 60 degrees of azimuth."""
+    whole = shown()
+    cameras = [Camera.orbit(middle + 6.0 * k, 20.0, 4.0, fov=0.7, width=32, height=24) for k in range(-5, 6)]
+    return replace(whole, views={"train": tuple(View(f"v{k}", c, 0.0) for k, c in enumerate(cameras))})
+
+
+@pytest.mark.parametrize("path", [None, "views"])
+@pytest.mark.parametrize("middle", [0.0, 130.0, 180.0])
+def test_a_video_of_a_capture_from_one_side_stays_there_and_never_jumps(path: str | None, middle: float) -> None:
+    frames = frames_of(one_sided(middle), ViewRequest(), path, "camera", 60)
+    angles = azimuths(np.stack([camera.center for camera, _ in frames]), UNITS.up)
+    away = np.remainder(angles - middle + 180.0, 360.0) - 180.0
+    assert -35.0 < away.min() < -25.0 < 20.0 < away.max() < 35.0
+    assert np.abs(np.diff(np.append(away, away[0]))).max() < 5.0  # 120 degrees in 60 frames
+
+
+def test_an_orbit_that_is_asked_for_goes_around_a_capture_from_one_side() -> None:
+    for path, request in (("orbit", ViewRequest()), (None, ViewRequest(azimuth=130.0))):
+        frames = frames_of(one_sided(130.0), request, path, "camera", 36)
+        angles = azimuths(np.stack([camera.center for camera, _ in frames]), UNITS.up)
+        away = np.remainder(angles - angles[0] + 1.0, 360.0) - 1.0
+        assert abs(angles[0] - 130.0) < 1e-6
+        np.testing.assert_allclose(away, np.arange(36) * 10.0, atol=1e-6)
+
+
+def test_a_video_of_a_capture_from_all_sides_goes_around_it() -> None:
+    frames = frames_of(shown(), ViewRequest(), None, "camera", 8)
+    turned = frames_of(shown(), ViewRequest(), "orbit", "camera", 8)
+    for (camera, _), (expected, _) in zip(frames, turned, strict=True):
+        np.testing.assert_array_equal(camera.world_to_camera, expected.world_to_camera)
 
 
 def test_a_spline_passes_through_its_keys() -> None:
