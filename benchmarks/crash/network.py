@@ -47,6 +47,8 @@ def link() -> Iterator[Link]:
         for name in (_INSIDE, "lo"):
             _ip("-n", _NAME, "link", "set", name, "up")
         yield Link()
+        # A network lives on while processes in it end, and its link with it: the next one needs the name.
+        _ip("link", "delete", _OUTSIDE)
     finally:
         _ip("netns", "delete", _NAME)
 

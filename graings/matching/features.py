@@ -57,12 +57,12 @@ def extract(frames: Sequence[Frame], images: ImageStore) -> list[Features]:
     return [_features(images.rgb(frame) @ LUMA, images.valid(frame), extractor) for frame in frames]
 
 
-def reduced(frame: Frame) -> Frame:
-    """`frame` with a camera of at most `MAX_SIFT_SIDE` px."""
+def reduced(frame: Frame, most: int = MAX_SIFT_SIDE) -> Frame:
+    """`frame` with a camera of at most `most` px along its longer side."""
     camera, longest = frame.camera, max(frame.camera.width, frame.camera.height)
-    if longest <= MAX_SIFT_SIDE:
+    if longest <= most:
         return frame
-    width, height = (max(1, round(side * MAX_SIFT_SIDE / longest)) for side in (camera.width, camera.height))
+    width, height = (max(1, round(side * most / longest)) for side in (camera.width, camera.height))
     return replace(frame, camera=camera.resized(width, height))
 
 

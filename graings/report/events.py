@@ -1,105 +1,25 @@
 """Events: what happened in a training run beside its ordinary steps, one small model for each kind.
 
-An event is its iteration, its kind and numbers. The message for people is derived from them, and travels with the
-event wherever it is written. Programs decide by `kind`.
+Those of its start are in `start_events`.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, computed_field, model_validator
+from pydantic import Field
 
-from graings.document import Document
-
-Channel = Annotated[float, Field(ge=0, le=1)]
-
-KIND: Final = "Kind of the event."
-
-
-class _Event(Document):
-    """What all events share."""
-
-    iteration: int = Field(ge=0, description="Iteration of the run in which it happened; 0 before the first step.")
-
-    @computed_field(description="The event in plain words, derived from its numbers.")  # type: ignore[prop-decorator]
-    @property
-    def message(self) -> str:
-        """The event in plain words."""
-        return self._words()
-
-    @abstractmethod
-    def _words(self) -> str:
-        """The sentence of `message`."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_message(cls, values: Any) -> Any:
-        """The message is written, but not read: it follows from the other fields."""
-        return {key: values[key] for key in values if key != "message"} if isinstance(values, dict) else values
-
-    def at(self, iteration: int) -> Self:
-        """The same event at another iteration."""
-        return self.model_copy(update={"iteration": iteration})
+from graings.report.start_events import (
+    BackgroundFound,
+    LowResolutionStarted,
+    MotionFound,
+    PointsInitialized,
+    TimeWindowStarted,
+)
+from graings.report.training_event import KIND, TrainingEvent
 
 
-class BackgroundFound(_Event):
-    """The colour of the background is not white."""
-
-    kind: Literal["background"] = Field("background", description=KIND)
-    color: tuple[Channel, Channel, Channel] = Field(description="RGB in [0, 1].")
-
-    def _words(self) -> str:
-        name = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.color)
-        return f"pixels of the colour {name} count as background"
-
-
-class PointsInitialized(_Event):
-    """Where the first anchors come from, in a capture without point cloud whose masks cover the whole image."""
-
-    kind: Literal["initial_points"] = Field("initial_points", description=KIND)
-    source: Literal["random", "triangulation"] = Field(
-        description="random: uniform in a cube. triangulation: matched between pairs of images."
-    )
-    triangulated: int | None = Field(
-        ge=0, description="Points matched between pairs of images; null without the extra graings[colmap]."
-    )
-    interpolated: int = Field(0, ge=0, description="Points added between the triangulated ones.")
-
-    def _words(self) -> str:
-        if self.source == "triangulation":
-            count, between = f"{self.triangulated:,}", f"{self.interpolated:,}"
-            return f"initial points: {count} triangulated from pairs of images, {between} interpolated between them"
-        if self.triangulated is None:
-            return (
-                "initial points: random, because there is neither a point cloud nor a mask; "
-                "with the extra graings[colmap] they are triangulated from the images"
-            )
-        return f"initial points: random, because only {self.triangulated} could be triangulated from pairs of images"
-
-
-class TimeWindowStarted(_Event):
-    """Training begins with a part of the clip."""
-
-    kind: Literal["time_window"] = Field("time_window", description=KIND)
-    share: float = Field(gt=0, lt=1, description="Share of the clip, around its middle, that the first steps use.")
-
-    def _words(self) -> str:
-        return f"training begins with the middle {100 * self.share:.3g} % of the clip and widens to all of it"
-
-
-class LowResolutionStarted(_Event):
-    """Training begins with downscaled images."""
-
-    kind: Literal["low_resolution"] = Field("low_resolution", description=KIND)
-    factor: int = Field(gt=1, description="How many times smaller along each side the first images are.")
-
-    def _words(self) -> str:
-        return f"training begins with images of 1/{self.factor} of their width and height"
-
-
-class Grew(_Event):
+class Grew(TrainingEvent):
     """Anchors were added."""
 
     kind: Literal["grew"] = Field("grew", description=KIND)
@@ -109,7 +29,7 @@ class Grew(_Event):
         return f"grew {self.anchors:,} anchors"
 
 
-class GrowthCapped(_Event):
+class GrowthCapped(TrainingEvent):
     """More anchors qualified for growth than could be added."""
 
     kind: Literal["growth_capped"] = Field("growth_capped", description=KIND)
@@ -121,7 +41,7 @@ class GrowthCapped(_Event):
         return f"growth was limited: {budget}, and more qualified than may be added at once"
 
 
-class Pruned(_Event):
+class Pruned(TrainingEvent):
     """Anchors that show nothing were removed."""
 
     kind: Literal["pruned"] = Field("pruned", description=KIND)
@@ -131,7 +51,7 @@ class Pruned(_Event):
         return f"pruned {self.anchors:,} anchors"
 
 
-class Unseen(_Event):
+class Unseen(TrainingEvent):
     """After the last step, anchors that no training view shows were removed."""
 
     kind: Literal["unseen"] = Field("unseen", description=KIND)
@@ -141,7 +61,7 @@ class Unseen(_Event):
         return f"removed {self.anchors:,} anchors that no training view shows"
 
 
-class Thinned(_Event):
+class Thinned(TrainingEvent):
     """More anchors were there from the start than the budget allows: a random part of them was removed."""
 
     kind: Literal["thinned"] = Field("thinned", description=KIND)
@@ -153,7 +73,7 @@ class Thinned(_Event):
         return f"thinned {before} anchors to {after}: the budget leaves no room for growth"
 
 
-class GrowthQuiet(_Event):
+class GrowthQuiet(TrainingEvent):
     """Several growths in a row added no anchor."""
 
     kind: Literal["growth_quiet"] = Field("growth_quiet", description=KIND)
@@ -165,7 +85,7 @@ class GrowthQuiet(_Event):
         return f"{self.growths} growths in a row added no anchor: {then}"
 
 
-class PartDropped(_Event):
+class PartDropped(TrainingEvent):
     """Training measured that a part of the model does not show, and leaves it out from here on."""
 
     kind: Literal["part_dropped"] = Field("part_dropped", description=KIND)
@@ -178,7 +98,7 @@ class PartDropped(_Event):
         )
 
 
-class GradientsClipped(_Event):
+class GradientsClipped(TrainingEvent):
     """The gradients of one group of parameters were far above their usual norm and were scaled down."""
 
     kind: Literal["clipped"] = Field("clipped", description=KIND)
@@ -192,7 +112,7 @@ class GradientsClipped(_Event):
         return f"gradients of {self.group} clipped from norm {self.norm:.3g} to {self.limit:.3g} (views {views})"
 
 
-class StepSkipped(_Event):
+class StepSkipped(TrainingEvent):
     """The loss or a gradient was not finite; the parameters were left as they were."""
 
     kind: Literal["skipped"] = Field("skipped", description=KIND)
@@ -205,7 +125,7 @@ class StepSkipped(_Event):
         return f"step skipped: {self.non_finite} was not finite (views {views} at t = {_list(self.times)})"
 
 
-class RolledBack(_Event):
+class RolledBack(TrainingEvent):
     """Training went wrong and continues from an earlier state, with lower learning rates and another order of views."""
 
     kind: Literal["rolled_back"] = Field("rolled_back", description=KIND)
@@ -220,7 +140,7 @@ class RolledBack(_Event):
         )
 
 
-class OpacityReset(_Event):
+class OpacityReset(TrainingEvent):
     """In a whole pass over the views nothing was drawn: opacities were raised."""
 
     kind: Literal["opacity_reset"] = Field("opacity_reset", description=KIND)
@@ -234,7 +154,7 @@ class OpacityReset(_Event):
         )
 
 
-class Restarted(_Event):
+class Restarted(TrainingEvent):
     """A moving object was missing: training starts again with tracks of it, or on a part of the clip."""
 
     kind: Literal["restart"] = Field("restart", description=KIND)
@@ -248,7 +168,7 @@ class Restarted(_Event):
         return f"training starts again with {start}: the model missed a moving object. `time_window=1` prevents this."
 
 
-class Stiff(_Event):
+class Stiff(TrainingEvent):
     """The last optimiser steps were longer than the Gaussians they moved."""
 
     kind: Literal["stiff"] = Field("stiff", description=KIND)
@@ -263,7 +183,7 @@ class Stiff(_Event):
         )
 
 
-class Diverged(_Event):
+class Diverged(TrainingEvent):
     """Training went wrong once more than it may roll back, and ended."""
 
     kind: Literal["diverged"] = Field("diverged", description=KIND)
@@ -278,6 +198,7 @@ Event = Annotated[
     | PointsInitialized
     | TimeWindowStarted
     | LowResolutionStarted
+    | MotionFound
     | Grew
     | GrowthCapped
     | Pruned

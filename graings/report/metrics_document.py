@@ -15,8 +15,9 @@ from graings.document import Document, read_document
 from graings.evaluation.metrics import PSNR_CAP, SplitMetrics
 from graings.evaluation.motion import MotionMetrics
 from graings.plan.plan import Plan
-from graings.report.events import Channel, Event
+from graings.report.events import Event
 from graings.report.machine import MachineFacts, VersionFacts
+from graings.report.start_events import Channel
 
 METRICS_FILE: Final = "metrics.json"
 

@@ -21,7 +21,7 @@ from graings.kernel import computing_threads
 from graings.plan.capture_statistics import measure
 from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan, make_plan
-from graings.report.events import Diverged, Event, Restarted
+from graings.report.events import Diverged, Event
 from graings.report.metrics_document import METRICS_FILE, EvaluationPoint, read_metrics
 from graings.report.run_record import read_plan, read_record
 from graings.storage.checkpoint import (
@@ -39,6 +39,7 @@ from graings.training.density.unseen import drop_unseen
 from graings.training.plan_revision import PlanRevision
 from graings.training.run_output import RunOutput, RunReport, psnr_of_best
 from graings.training.timing import Clock, Rate, evaluation_marks
+from graings.training.tracks.feature_tracks import feature_tracks
 from graings.training.tracks.motion_tracks import MotionTracks
 from graings.training.trainer import Trainer
 from graings.training.training_log import TrainingLog
@@ -88,7 +89,7 @@ class TrainingRun:
         data = load_capture(capture, config.capture)
         clock.add("load", time.perf_counter() - started)
         run = cls(folder, data, config, None, clock)
-        run._start(RestartState())
+        run._start()
         folder.mkdir(parents=True, exist_ok=True)
         run.log.write_run()
         run.revision.write()
@@ -111,7 +112,7 @@ class TrainingRun:
         clock.add("load", time.perf_counter() - started)
         run = cls(folder, data, config, threads, clock, read_plan(folder) or record.plan)
         if newest_checkpoint(folder) is None:
-            run._start(RestartState())
+            run._start()
             return run
         model, state = load_training(folder)
         with intact(model.path), computing_threads(run.threads):
@@ -129,10 +130,13 @@ class TrainingRun:
         run._best_psnr = psnr_of_best(folder, run._restart)
         return run
 
-    def _start(self, restart: RestartState, tracks: MotionTracks | None = None) -> None:
-        """A new scene, of the whole run or after a restart."""
+    def _start(self, restart: RestartState | None = None, tracks: MotionTracks | None = None) -> None:
+        """A new scene, after a restart or, without one, of the whole run."""
         started, computed = time.perf_counter(), time.process_time()
         with computing_threads(self.threads):
+            if restart is None:
+                tracks = feature_tracks(self.capture, self.images, self.applied)
+                restart = RestartState.first(tracks is not None)
             config = restart.config(self.applied)
             self._trainer = Trainer.start(self.capture, self.images, config, restart.iterations_before, tracks)
         self._restart = restart
@@ -223,8 +227,8 @@ class TrainingRun:
         the run was to have: with only the remaining ones a draft is 5 dB worse. A time window that was configured
         stays; one that was chosen from the masks gives way to tracks, but not to another window.
         """
-        trainer, before, configured = self._trainer, self._restart.iterations_before, self.applied.time_window
-        due = self.iteration == check_iteration(self.applied) and before == 0
+        trainer, configured = self._trainer, self.applied.time_window
+        due = self.iteration == check_iteration(self.applied) and self._restart == RestartState()
         if not due or configured is not None or not trainer.scene.temporal:
             return ()
         started, computed = time.perf_counter(), time.process_time()
@@ -232,12 +236,8 @@ class TrainingRun:
         self.log.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
         if found is None or (found.tracks is None and trainer.window.share(1) < 1):
             return ()
-        iteration, tracks = self.iteration, found.tracks
-        self._start(RestartState(iteration, found.time_window, tracks is not None), tracks)
-        count = 0 if tracks is None else len(tracks.points)
-        event = Restarted(
-            iteration=iteration, missing_share=found.share, time_window=found.time_window, tracked_points=count
-        )
+        event = found.event(self.iteration)
+        self._start(RestartState(self.iteration, found.time_window, found.tracks is not None), found.tracks)
         self.log.note([event])
         return (event,)
 

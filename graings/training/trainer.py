@@ -21,17 +21,15 @@ from graings.errors import DivergedError
 from graings.plan.rules import QUIET_GROWTHS
 from graings.render import draw, low_pass
 from graings.report.events import (
-    BackgroundFound,
     Event,
     GradientsClipped,
     GrowthCapped,
     GrowthQuiet,
-    LowResolutionStarted,
     OpacityReset,
     RolledBack,
     StepSkipped,
-    TimeWindowStarted,
 )
+from graings.report.start_events import BackgroundFound, LowResolutionStarted, MotionFound, TimeWindowStarted
 from graings.scene.scene import Composition, Scene
 from graings.training.guard.collapse import RESET_OPACITY, raise_opacity
 from graings.training.guard.guard import Gradient, Guard, StepCheck, first_not_finite
@@ -134,6 +132,8 @@ class Trainer(TrainerState):
             events.append(TimeWindowStarted(iteration=iteration, share=share))
         if (factor := self.pyramid.at(1).factor) > 1:
             events.append(LowResolutionStarted(iteration=iteration, factor=factor))
+        if self.tracks is not None and self.iterations_before == 0:
+            events.append(MotionFound(iteration=iteration, tracked_points=len(self.tracks.points)))
         return events
 
     def _set_sampling_rate(self, sampling: SamplingRate) -> None:

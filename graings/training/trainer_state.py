@@ -12,7 +12,7 @@ from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.config.schedule import Phase, phases
 from graings.random import RandomStreams
-from graings.report.events import PointsInitialized
+from graings.report.start_events import PointsInitialized
 from graings.scene.scene import Scene
 from graings.training.curriculum.image_pyramid import ImagePyramid
 from graings.training.curriculum.time_window import TimeWindow

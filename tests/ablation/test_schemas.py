@@ -16,7 +16,7 @@ from graings.footage.report import FootageCamera, FootageReport
 from graings.inspection.inspect import inspect_capture
 from graings.player.scene_file import read_scene, scene_bytes
 from graings.render import PreparedScene, fast_scene
-from graings.report import events
+from graings.report import events, start_events
 from graings.report.events import Event, Grew, StepSkipped
 from graings.report.folder import report_runs
 from graings.storage.compact import open_model
@@ -28,12 +28,13 @@ SCRIPT = runpy.run_path(str(ROOT / "scripts" / "write_schemas"))
 
 # One of each kind.
 EVENTS: tuple[Event, ...] = (
-    events.BackgroundFound(iteration=1, color=(0.0, 0.0, 0.0)),
-    events.PointsInitialized(iteration=1, source="random", triangulated=None),
-    events.PointsInitialized(iteration=1, source="random", triangulated=12),
-    events.PointsInitialized(iteration=1, source="triangulation", triangulated=4_000, interpolated=900),
-    events.TimeWindowStarted(iteration=1, share=0.25),
-    events.LowResolutionStarted(iteration=1, factor=2),
+    start_events.BackgroundFound(iteration=1, color=(0.0, 0.0, 0.0)),
+    start_events.PointsInitialized(iteration=1, source="random", triangulated=None),
+    start_events.PointsInitialized(iteration=1, source="random", triangulated=12),
+    start_events.PointsInitialized(iteration=1, source="triangulation", triangulated=4_000, interpolated=900),
+    start_events.TimeWindowStarted(iteration=1, share=0.25),
+    start_events.LowResolutionStarted(iteration=1, factor=2),
+    start_events.MotionFound(iteration=1, tracked_points=400),
     Grew(iteration=200, anchors=3),
     events.GrowthCapped(iteration=200, anchors=90, max_anchors=100),
     events.Pruned(iteration=200, anchors=2),

@@ -17,6 +17,7 @@ from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.evaluation.evaluate import subset
 from graings.random import RandomStreams
+from graings.report.events import Restarted
 from graings.scene.prepared import PreparedScene
 from graings.scene.scene import Scene
 from graings.training.curriculum.time_window import TimeWindow
@@ -63,6 +64,13 @@ class MissingMotion:
                 return cls(share, 1.0, tracks)
         window = restart_window(config, [frame.time for frame in capture.train])
         return None if window is None or share <= MAX_MISSING_FRACTION else cls(share, window)
+
+    def event(self, iteration: int) -> Restarted:
+        """What the report says of the restart after `iteration`."""
+        points = 0 if self.tracks is None else len(self.tracks.points)
+        return Restarted(
+            iteration=iteration, missing_share=self.share, time_window=self.time_window, tracked_points=points
+        )
 
 
 def check_iteration(config: TrainConfig) -> int | None:

@@ -1,6 +1,7 @@
 """RestartState: which part of a run belongs to one training from the first anchors to the last step.
 
-A run restarts once at most, where training has missed an object with large motion (`missing_motion`).
+A run restarts once at most, where training has missed an object with large motion (`missing_motion`). One that begins
+with tracks (`feature_tracks`) does not.
 """
 
 from __future__ import annotations
@@ -21,6 +22,11 @@ class RestartState:
     iterations_before: int = 0
     time_window: float | None = None
     tracked: bool = False
+
+    @classmethod
+    def first(cls, tracked: bool) -> RestartState:
+        """The start of a run."""
+        return cls(0, 1.0, tracked) if tracked else cls()
 
     def config(self, config: TrainConfig) -> TrainConfig:
         """`config` with the time window of the restart, and its warm-up."""

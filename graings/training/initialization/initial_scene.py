@@ -20,7 +20,7 @@ from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.random import RandomStreams
-from graings.report.events import PointsInitialized
+from graings.report.start_events import PointsInitialized
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.training.curriculum.time_window import TimeWindow
