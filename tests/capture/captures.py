@@ -108,7 +108,7 @@ def write_walled(folder: Path, cameras: Sequence[Camera]) -> Path:
         local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         towards = local @ camera.world_to_camera[:3, :3]
         x, y, _ = np.moveaxis(camera.center - camera.center[2] / towards[..., 2:] * towards, -1, 0)
-        colors = _interpolated(paint, 5.0 * x, 5.0 * y)
+        colors = interpolated(paint, 5.0 * x, 5.0 * y)
         name = f"images/{index:03d}"
         write_image(folder / f"{name}.png", np.rint(255 * colors).astype(np.uint8))
         frames["val" if index % 8 == 7 else "train"].append(entry(camera, name, index / len(cameras)))
@@ -118,7 +118,7 @@ def write_walled(folder: Path, cameras: Sequence[Camera]) -> Path:
     return folder
 
 
-def _interpolated(paint: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def interpolated(paint: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """`paint` [n, n, 3], repeated periodically, at x and y, smoothly interpolated."""
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
     wx, wy = (3 * w**2 - 2 * w**3 for w in ((x - left)[..., None], (y - top)[..., None]))
