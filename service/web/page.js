@@ -105,7 +105,10 @@ function summary(job) {
   const done = `${count(report.iteration)} of ${count(report.iterations)}`;
   if (job.state !== "running") return `${done} · ${ago(job.finished_at || job.created_at)}`;
   if (report.step === "drawing") return `drawing the images: ${count(report.step_done)} of ${count(report.step_total)}`;
-  if (report.phase === "capture") return `finding the cameras: ${report.step} ${count(report.step_done)} of ${count(report.step_total)}`;
+  if (report.phase === "capture") {
+    const parts = report.step_total > 1 ? ` ${count(report.step_done)} of ${count(report.step_total)}` : "";
+    return `finding the cameras: ${report.step}${parts}`;
+  }
   if (report.phase === "loading") return "loading the capture";
   return report.eta_s == null ? done : `${done} · ${span(report.eta_s)} left`;
 }

@@ -40,7 +40,8 @@ export class Stage {
     if (!job) return;
     const address = job.links.scene;
     if (!address) {
-      this.player.say("The first checkpoint is not written yet.");
+      const waits = job.state === "queued" || job.state === "running";
+      this.player.say(waits ? "The first checkpoint is not written yet." : "This job ended before its first checkpoint.");
       return;
     }
     if (!this.shown) {
