@@ -26,6 +26,7 @@ from graings.footage.poses import reconstruct
 from graings.footage.registration import MIN_TRACK, check_usable, measure, nothing_registered, upright
 from graings.footage.report import REPORT_FILE, FootageReport
 from graings.footage.sharpness import blurred
+from graings.footage.source import find_footage
 from graings.footage.video import extract_frames
 from graings.storage.files import write_document, write_json
 
@@ -52,13 +53,15 @@ def make_capture(
 ) -> FootageReport:
     """Write the capture of `source` to the folder `target` and return what was found.
 
-    Of a video at most `frames` frames are taken, of a folder all photographs; images have no side above `max_side` px.
-    A `static` capture has no times. `observe` is called with the phase, what is done of it and its total. Raises
-    `CaptureError` where the source cannot be read, where its frames do not fit together, and for a `target` that holds
+    Of a video at most `frames` frames are taken, of a folder all photographs, or those of its only folder; images have
+    no side above `max_side` px. A `static` capture has no times. `observe` is called with the phase, what is done of it
+    and its total. Raises `CaptureError` where the source cannot be read, where its frames do not fit together, and for a `target` that holds
     a capture, was begun with another source, or is being written by another process.
     """
     if not source.exists():
         raise CaptureError("does not exist", file=source, remedy="Give a video or a folder of photographs.")
+    if source.is_dir() and not photographs(source):
+        source = find_footage(source) or source  # as the service does: the folder of a folder, or of a lone video
     if (target / TRANSFORMS).exists():
         raise CaptureError("holds a capture already", file=target, remedy="Choose another folder.")
     workspace = target / WORKSPACE

@@ -174,6 +174,16 @@ def test_a_missing_source_and_an_empty_folder_are_named(tmp_path: Path) -> None:
         make_capture(tmp_path / "empty", tmp_path / "d")
 
 
+def test_photographs_may_lie_one_folder_down(tmp_path: Path) -> None:
+    inner = tmp_path / "clip" / "images"
+    inner.mkdir(parents=True)
+    for index in range(9):
+        (inner / f"{index}.png").write_bytes(encode_image(np.full((64, 64, 3), 0.5, np.float32)))
+    with pytest.raises(CaptureError, match="none of 9 frames") as caught:
+        make_capture(tmp_path / "clip", tmp_path / "c")
+    assert "images" in str(caught.value)
+
+
 def test_near_frames_and_loops_are_matched_once() -> None:
     chosen = pairs(100)
     assert len(set(chosen)) == len(chosen)
