@@ -55,8 +55,8 @@ def make_capture(
 
     Of a video at most `frames` frames are taken, of a folder all photographs, or those of its only folder; images have
     no side above `max_side` px. A `static` capture has no times. `observe` is called with the phase, what is done of it
-    and its total. Raises `CaptureError` where the source cannot be read, where its frames do not fit together, and for a `target` that holds
-    a capture, was begun with another source, or is being written by another process.
+    and its total. Raises `CaptureError` where the source cannot be read, where its frames do not fit together, and for
+    a `target` that holds a capture, was begun with another source, or is being written by another process.
     """
     if not source.exists():
         raise CaptureError("does not exist", file=source, remedy="Give a video or a folder of photographs.")
