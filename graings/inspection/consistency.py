@@ -21,7 +21,7 @@ from graings.camera.units import Units
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
 from graings.document import Document
-from graings.matching.features import Features, extract, matches, neighbours, reduced
+from graings.matching.features import MAX_SIFT_SIDE, Features, extract, matches, neighbours, reduced
 from graings.matching.rays import ray_intersections
 
 Array = NDArray[np.float64]
@@ -92,7 +92,10 @@ def consistency(frames: Sequence[Frame], images: ImageStore, units: Units, *, op
     Masked pixels are not used. Raises `CaptureError` where an image cannot be read.
     """
     count = min(IMAGES, len(frames))
-    chosen = [reduced(frames[index]) for index in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+    chosen = [
+        reduced(frames[index], MAX_SIFT_SIDE)
+        for index in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
+    ]
     try:
         features = extract(chosen, images)
     except ImportError:

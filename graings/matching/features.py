@@ -57,7 +57,7 @@ def extract(frames: Sequence[Frame], images: ImageStore) -> list[Features]:
     return [_features(images.rgb(frame) @ LUMA, images.valid(frame), extractor) for frame in frames]
 
 
-def reduced(frame: Frame, most: int = MAX_SIFT_SIDE) -> Frame:
+def reduced(frame: Frame, most: int) -> Frame:
     """`frame` with a camera of at most `most` px along its longer side."""
     camera, longest = frame.camera, max(frame.camera.width, frame.camera.height)
     if longest <= most:

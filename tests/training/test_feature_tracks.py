@@ -17,7 +17,7 @@ from graings.config import TrainConfig
 from graings.training.run import TrainingRun
 from graings.training.tracks import feature_tracks as module
 from graings.training.tracks.feature_tracks import feature_tracks
-from graings.training.tracks.moving_features import FeatureMotion, shift_at_rest
+from graings.training.tracks.moving_features import FeatureMotion, MovingFeatures, shift_at_rest
 from tests.training.micro import micro_config
 from tests.training.video import HALF, camera, off_board, on_board, write_video
 
@@ -162,6 +162,13 @@ def test_a_point_takes_part_in_the_turn_of_the_features_around_it() -> None:
     np.testing.assert_allclose(
         module._steps(point, [FeatureMotion(start, end)])[0], point @ turn.T + [0, 0, 2], atol=0.02
     )
+
+
+def test_a_frame_that_sees_no_point_has_no_moving_features(crossed: Path) -> None:
+    capture = load_capture(crossed)
+    behind = capture.train[0].camera.center - capture.train[0].camera.forward
+    moving = MovingFeatures(capture.train[:2], images(), behind[None])
+    assert len(moving.between(0, 1).start) == 0
 
 
 def test_the_shift_of_points_is_a_part_of_the_image() -> None:

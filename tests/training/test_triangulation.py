@@ -13,7 +13,6 @@ from graings.camera.camera import Camera
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig
-from graings.matching import features
 from graings.matching.rays import ray_intersections
 from graings.training.initialization import triangulation
 from graings.training.initialization.triangulation import fill_untextured, tracks, triangulate
@@ -110,7 +109,7 @@ def test_filled_points_have_the_depth_of_the_nearest_point(tmp_path: Path) -> No
 
 def test_large_images_are_downscaled_for_sift(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_walled(tmp_path, _cameras(range(0, 80, 10)))
-    monkeypatch.setattr(features, "MAX_SIFT_SIDE", 64)
+    monkeypatch.setattr(triangulation, "MAX_SIFT_SIDE", 64)
     small = load_capture(folder, CaptureConfig(max_side=64))
     found, same = (triangulate(each.train, ImageStore((1.0, 1.0, 1.0))) for each in (load_capture(folder), small))
     assert len(found.points) > 100

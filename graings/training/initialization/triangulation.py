@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from graings.camera.camera import Camera
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
-from graings.matching.features import at, extract, matches, neighbours, reduced
+from graings.matching.features import MAX_SIFT_SIDE, at, extract, matches, neighbours, reduced
 from graings.matching.rays import directions, in_front, ray_intersections
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ def triangulate(frames: Sequence[Frame], images: ImageStore) -> Triangulated:
     Matches that share a feature form a track, whose point is the median of its intersections. Raises `ImportError`
     without pycolmap, and `CaptureError` where an image cannot be read.
     """
-    chosen = [reduced(frames[index]) for index in _spread(len(frames), IMAGES)]
+    chosen = [reduced(frames[index], MAX_SIFT_SIDE) for index in _spread(len(frames), IMAGES)]
     features = extract(chosen, images)
     cameras = [frame.camera for frame in chosen]
     first = np.cumsum([0] + [len(each.pixels) for each in features])  # index of each image's first feature

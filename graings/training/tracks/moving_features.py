@@ -38,7 +38,6 @@ PLACES: Final = 64
 AGREEING: Final = 8
 MAX_DISAGREEMENT: Final = 0.5
 
-
 # Frames whose features are kept, 2 MB each.
 KEPT: Final = 6
 
@@ -73,7 +72,7 @@ class MovingFeatures:
         first, second = self._features(one), self._features(other)
         a, b = matches(first.descriptors, second.descriptors)
         start, end = self._places(one, first.pixels[a]), self._places(other, second.pixels[b])
-        ahead = in_front(self.frames[other].camera, start)
+        ahead = in_front(self.frames[other].camera, start) & np.isfinite(end).all(axis=1)
         start, end, pixels = start[ahead], end[ahead], second.pixels[b[ahead]]
         shift = np.linalg.norm(self.frames[other].camera.project(start)[0] - pixels, axis=1)
         moves = shift > MIN_SHIFT * self._side(other)
@@ -112,13 +111,15 @@ def _within(camera: Camera, pixels: Points) -> NDArray[np.bool_]:
 
 
 def _depths(camera: Camera, rest: Points) -> Points:
-    """Depths [h, w] of square places of the image, each from the points nearest to it in the image."""
+    """Depths [h, w] of square places of the image, each from the points nearest to it; NaN if none is in front."""
     step = max(camera.width, camera.height) / PLACES
     ahead = rest[in_front(camera, rest)]
     pixels = camera.project(ahead)[0]
     inverse = 1.0 / ((ahead - camera.center) @ camera.forward)
     rows, columns = (np.arange(np.ceil(side / step)) + 0.5 for side in (camera.height, camera.width))
     places = np.stack(np.meshgrid(columns * step, rows * step), axis=-1)
+    if len(ahead) == 0:
+        return np.full(places.shape[:2], np.nan)
     apart = torch.cdist(torch.from_numpy(places.reshape(-1, 2)), torch.from_numpy(pixels))
     nearest = apart.topk(min(NEAREST, len(ahead)), largest=False).indices.numpy()
     depths: Points = (1.0 / np.median(inverse[nearest], axis=1)).reshape(places.shape[:2])
