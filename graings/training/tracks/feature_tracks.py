@@ -19,7 +19,7 @@ from graings.capture.images import ImageStore
 from graings.config import TrainConfig
 from graings.random import RandomStreams
 from graings.training.curriculum.missing_motion import check_iteration
-from graings.training.tracks.motion_tracks import RESTING, TRACKED, MotionTracks
+from graings.training.tracks.motion_tracks import RESTING, TRACKED, MotionTracks, subsampled
 from graings.training.tracks.moving_features import FeatureMotion, MovingFeatures, Points, shift_at_rest
 
 # A video has at least so many frames, and points at rest move by less than this part of the image from one to the next.
@@ -126,10 +126,10 @@ def _gathered(motions: Sequence[FeatureMotion], frame: int, generator: torch.Gen
     """At most `TRACKED` moving features of all frames, carried to `frame`."""
     before, after = np.empty((2, 0, 3))
     for motion in motions[:frame]:
-        before = _steps(_sample(np.concatenate([before, motion.start]), GATHERED, generator), [motion])[-1]
+        before = _steps(subsampled(np.concatenate([before, motion.start]), GATHERED, generator), [motion])[-1]
     for motion in reversed([motion.reversed() for motion in motions[frame:]]):
-        after = _steps(_sample(np.concatenate([after, motion.start]), GATHERED, generator), [motion])[-1]
-    return _sample(_not_alone(np.concatenate([before, after])), TRACKED, generator)
+        after = _steps(subsampled(np.concatenate([after, motion.start]), GATHERED, generator), [motion])[-1]
+    return subsampled(_not_alone(np.concatenate([before, after])), TRACKED, generator)
 
 
 def _followed(points: Points, motions: Sequence[FeatureMotion], frame: int) -> Points:
@@ -180,7 +180,3 @@ def _not_alone(points: Points) -> Points:
     """Without points that are three times farther than usual from their neighbours."""
     apart = _nearest(points, points, min(len(points), 9))[0][:, -1]
     return points[apart <= 3 * np.median(apart)]
-
-
-def _sample(points: Points, most: int, generator: torch.Generator) -> Points:
-    return points[torch.randperm(len(points), generator=generator)[:most].numpy()]

@@ -76,10 +76,10 @@ def find_tracks(
     if found is None or len(found) < 2:
         return None
     times = np.array([time for time, _ in found])
-    hulls = [_subsampled(hull, FITTED, generator) for _, hull in found]
+    hulls = [subsampled(hull, FITTED, generator) for _, hull in found]
     usable = [index for index, hull in enumerate(hulls) if len(hull)]
     reference = min(usable, key=lambda index: abs(times[index] - 0.5))
-    points = _subsampled(hulls[reference], TRACKED, generator)
+    points = subsampled(hulls[reference], TRACKED, generator)
     components = _components(points)
     positions = _follow(points, components, hulls, reference)
     far = _followed_far(positions, components, hulls)
@@ -94,7 +94,8 @@ def find_tracks(
     )
 
 
-def _subsampled(points: Points, most: int, generator: torch.Generator) -> Points:
+def subsampled(points: Points, most: int, generator: torch.Generator) -> Points:
+    """At most `most` of points [M, 3], a random sample."""
     return points[torch.randperm(len(points), generator=generator)[:most].numpy()]
 
 
