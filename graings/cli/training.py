@@ -20,6 +20,7 @@ from graings.cli.terminal import busy_status, metrics_line, print_line
 from graings.config import PRESETS, make_config
 from graings.plan.rules import nothing_shown
 from graings.report.metrics_document import read_metrics
+from graings.storage.run_folder import RECORD_FILE
 from graings.training.run import TrainingRun
 
 Threads = Annotated[int | None, typer.Option(min=1, max=256, help="CPU threads (default: all cores).")]
@@ -63,8 +64,13 @@ def train(
         if threads is not None:
             overrides["threads"] = threads
         config = make_config(overrides=overrides)
-        with busy_status("reading the capture"):
-            run = TrainingRun.create(capture, output, config)
+        with busy_status("reading the capture, and placing the first points"):
+            try:
+                run = TrainingRun.create(capture, output, config)
+            except KeyboardInterrupt:
+                if (output / RECORD_FILE).exists():
+                    print_line(f"Stopped before the first step. Continue with: graings train --resume -o {output}")
+                raise
     interrupt = _take_steps(run)
     if run.iteration < run.iterations:
         print_line(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations, at a checkpoint.")

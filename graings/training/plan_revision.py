@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections import deque
 from typing import Final
 
@@ -50,12 +49,11 @@ class PlanRevision:
 
     def revise(self, trainer: Trainer, iteration: int) -> tuple[Event, ...]:
         """After an evaluation: leave the residual out if it does nothing. Returns what happened."""
-        started = time.perf_counter()
-        events = self._judge_residual(trainer, iteration)
-        self.log.note(events)
-        if events:
-            self.write()
-        self.log.clock.add("evaluation", time.perf_counter() - started)
+        with self.log.clock.timed("evaluation"):
+            events = self._judge_residual(trainer, iteration)
+            self.log.note(events)
+            if events:
+                self.write()
         return events
 
     def _judge_residual(self, trainer: Trainer, iteration: int) -> tuple[Event, ...]:

@@ -6,7 +6,6 @@ that diverges ends with `DivergedError` after its best model was made the newest
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -16,7 +15,7 @@ from graings.capture.capture import Capture
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.config import TrainConfig
-from graings.errors import CheckpointError, DivergedError
+from graings.errors import CheckpointError, DivergedError, GraingsError
 from graings.kernel import computing_threads
 from graings.plan.capture_statistics import measure
 from graings.plan.cost import stored_calibration
@@ -65,16 +64,15 @@ class TrainingRun:
         self.capture = capture
         self.config = config
         self.threads = threads if threads is not None else config.threads
-        started, computed = time.perf_counter(), time.process_time()
         seen = with_background(config.capture, capture)
         self.images = ImageStore(seen.background_rgb(), seen.cache_mb)
-        plan = plan or make_plan(measure(capture, self.images, seen.background_rgb()), config, stored_calibration())
+        if plan is None:
+            plan = make_plan(measure(capture, self.images, seen.background_rgb()), config, stored_calibration())
         self.applied = plan.apply(config).model_copy(update={"capture": seen})
         self.log = TrainingLog(folder, capture, config, plan, clock)
         self.revision = PlanRevision(self.log)
         self.output = RunOutput(folder, self.images, self.log)
         self._best_psnr: float | None = None
-        clock.add("init", time.perf_counter() - started, time.process_time() - computed)
 
     @classmethod
     def create(cls, capture: Path, folder: Path, config: TrainConfig) -> TrainingRun:
@@ -85,14 +83,19 @@ class TrainingRun:
         if (folder / RECORD_FILE).exists():
             raise CheckpointError(f"{folder}: already holds a run. Resume it (--resume) or choose another folder.")
         clock = Clock()
-        started = time.perf_counter()
-        data = load_capture(capture, config.capture)
-        clock.add("load", time.perf_counter() - started)
-        run = cls(folder, data, config, None, clock)
-        run._start()
+        with clock.timed("load"):
+            data = load_capture(capture, config.capture)
+        with clock.timed("init"):
+            run = cls(folder, data, config, None, clock)
+        # Written first: what crosses a video is searched for up to a minute, and an interrupted search can be resumed.
         folder.mkdir(parents=True, exist_ok=True)
         run.log.write_run()
         run.revision.write()
+        try:
+            run._start()
+        except GraingsError:
+            (folder / RECORD_FILE).unlink()
+            raise
         return run
 
     @classmethod
@@ -105,12 +108,12 @@ class TrainingRun:
         record = read_record(folder)
         config = record.config
         clock = Clock()
-        started = time.perf_counter()
-        data = load_capture(capture or record.capture.path, config.capture)
+        with clock.timed("load"):
+            data = load_capture(capture or record.capture.path, config.capture)
         if data.content_hash != record.capture.hash:
             raise CheckpointError(f"{data.root}: not the capture this run began with. Give the original one.")
-        clock.add("load", time.perf_counter() - started)
-        run = cls(folder, data, config, threads, clock, read_plan(folder) or record.plan)
+        with clock.timed("init"):
+            run = cls(folder, data, config, threads, clock, read_plan(folder) or record.plan)
         if newest_checkpoint(folder) is None:
             run._start()
             return run
@@ -132,8 +135,7 @@ class TrainingRun:
 
     def _start(self, restart: RestartState | None = None, tracks: MotionTracks | None = None) -> None:
         """A new scene, after a restart or, without one, of the whole run."""
-        started, computed = time.perf_counter(), time.process_time()
-        with computing_threads(self.threads):
+        with self.log.clock.timed("init"), computing_threads(self.threads):
             if restart is None:
                 tracks = feature_tracks(self.capture, self.images, self.applied)
                 restart = RestartState.first(tracks is not None)
@@ -141,7 +143,6 @@ class TrainingRun:
             self._trainer = Trainer.start(self.capture, self.images, config, restart.iterations_before, tracks)
         self._restart = restart
         self._best_psnr = None
-        self.log.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
 
     @property
     def iteration(self) -> int:
@@ -231,9 +232,8 @@ class TrainingRun:
         due = self.iteration == check_iteration(self.applied) and self._restart == RestartState()
         if not due or configured is not None or not trainer.scene.temporal:
             return ()
-        started, computed = time.perf_counter(), time.process_time()
-        found = MissingMotion.find(trainer.scene, self.capture, self.images, self.applied)
-        self.log.clock.add("init", time.perf_counter() - started, time.process_time() - computed)
+        with self.log.clock.timed("init"):
+            found = MissingMotion.find(trainer.scene, self.capture, self.images, self.applied)
         if found is None or (found.tracks is None and trainer.window.share(1) < 1):
             return ()
         event = found.event(self.iteration)

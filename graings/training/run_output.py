@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -58,42 +57,49 @@ class RunOutput:
         frames = self.held_out()
         if not frames:
             return None
-        started = time.perf_counter()
-        held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background)
-        self.render_fps = held_out.frames_per_second
-        point = self._point(trainer, iteration, held_out.metrics, held_out.subpixel_share)
-        self.log.clock.add("evaluation", time.perf_counter() - started)
-        return point
+        with self.log.clock.timed("evaluation"):
+            held_out = self._measure(trainer, frames)
+            return self._point(trainer, iteration, held_out.metrics, held_out.subpixel_share)
 
     def evaluate_end(
         self, trainer: Trainer, iteration: int
     ) -> tuple[EvaluationPoint | None, dict[Split, SplitMetrics]]:
         """Measure all validation views once: the last point of the curve, and the metrics of the split."""
         frames = self.log.capture.val
-        started = time.perf_counter()
-        if not frames:
-            some = subset(self.log.capture.train, self.log.config.evaluation.views)
-            self.render_fps = HeldOut.measure(trainer.scene, some, self.images, trainer.background).frames_per_second
-            self.log.clock.add("evaluation", time.perf_counter() - started)
-            return None, {}
-        held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background, PerceptualDistances.find())
-        self.render_fps = held_out.frames_per_second
-        chosen = {frame.name for frame in self.held_out()}
-        of_curve = SplitMetrics.over([view for view in held_out.metrics.views if view.name in chosen])
-        point = self._point(trainer, iteration, of_curve, held_out.subpixel_share)
-        self.log.clock.add("evaluation", time.perf_counter() - started)
-        return point, {"val": held_out.metrics}
+        with self.log.clock.timed("evaluation"):
+            if not frames:
+                some = subset(self.log.capture.train, self.log.config.evaluation.views)
+                self.render_fps = HeldOut.measure(
+                    trainer.scene, some, self.images, trainer.background
+                ).frames_per_second
+                return None, {}
+            held_out = HeldOut.measure(
+                trainer.scene, frames, self.images, trainer.background, PerceptualDistances.find()
+            )
+            self.render_fps = held_out.frames_per_second
+            chosen = {frame.name for frame in self.held_out()}
+            of_curve = SplitMetrics.over([view for view in held_out.metrics.views if view.name in chosen])
+            point = self._point(trainer, iteration, of_curve, held_out.subpixel_share)
+            return point, {"val": held_out.metrics}
 
     def splits(self, trainer: Trainer) -> dict[Split, SplitMetrics]:
         """Metrics of all validation views of the scene as it is, without a point of the curve."""
         if not self.log.capture.val:
             return {}
-        started = time.perf_counter()
         frames = self.log.capture.val
-        held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background, PerceptualDistances.find())
+        with self.log.clock.timed("evaluation"):
+            held_out = HeldOut.measure(
+                trainer.scene, frames, self.images, trainer.background, PerceptualDistances.find()
+            )
+            self.render_fps = held_out.frames_per_second
+            return {"val": held_out.metrics}
+
+    def _measure(
+        self, trainer: Trainer, frames: Sequence[Frame], perceptual: PerceptualDistances | None = None
+    ) -> HeldOut:
+        held_out = HeldOut.measure(trainer.scene, frames, self.images, trainer.background, perceptual)
         self.render_fps = held_out.frames_per_second
-        self.log.clock.add("evaluation", time.perf_counter() - started)
-        return {"val": held_out.metrics}
+        return held_out
 
     def _point(self, trainer: Trainer, iteration: int, metrics: SplitMetrics, share: float | None) -> EvaluationPoint:
         stiffness = Stiffness(trainer.step_over_size, share, len(metrics.views))
@@ -101,19 +107,16 @@ class RunOutput:
 
     def stiffness(self, trainer: Trainer) -> Stiffness:
         """Of the end, over all training views."""
-        started = time.perf_counter()
         frames = self.log.capture.train
-        share = subpixel_share(trainer.scene, frames, trainer.background)
-        self.log.clock.add("evaluation", time.perf_counter() - started)
-        return Stiffness(trainer.step_over_size, share, len(frames))
+        with self.log.clock.timed("evaluation"):
+            share = subpixel_share(trainer.scene, frames, trainer.background)
+            return Stiffness(trainer.step_over_size, share, len(frames))
 
     def view_dependence(self, trainer: Trainer) -> float | None:
         """Loss of PSNR of the held-out views with the colours of other views, in dB; None without any."""
-        started = time.perf_counter()
         others = self.log.capture.train
-        loss = view_dependence(trainer.scene, self.held_out(), others, self.images, trainer.background)
-        self.log.clock.add("evaluation", time.perf_counter() - started)
-        return loss
+        with self.log.clock.timed("evaluation"):
+            return view_dependence(trainer.scene, self.held_out(), others, self.images, trainer.background)
 
     def psnr(self, trainer: Trainer, frames: Sequence[Frame]) -> float | None:
         """Mean PSNR of the scene as it is over `frames`, in dB."""
@@ -130,35 +133,32 @@ class RunOutput:
         instead_of_later: bool = False,
     ) -> Path:
         """Write a checkpoint; see `save_checkpoint`."""
-        started = time.perf_counter()
-        tensors, facts = trainer.state()
-        capture = self.log.capture
-        path = save_checkpoint(
-            self.folder,
-            scene=trainer.scene,
-            state=TrainingState(tensors, {"trainer": facts, "restart": asdict(restart), **self.log.state()}),
-            units=capture.units,
-            background=trainer.background,
-            views={split: [frame.view() for frame in capture.split(split)] for split in ALL_SPLITS},
-            config=self.log.config,
-            iteration=iteration,
-            finished=finished,
-            best=best,
-            instead_of_later=instead_of_later,
-        )
-        self.log.clock.add("checkpoint", time.perf_counter() - started)
-        return path
+        with self.log.clock.timed("checkpoint"):
+            tensors, facts = trainer.state()
+            capture = self.log.capture
+            return save_checkpoint(
+                self.folder,
+                scene=trainer.scene,
+                state=TrainingState(tensors, {"trainer": facts, "restart": asdict(restart), **self.log.state()}),
+                units=capture.units,
+                background=trainer.background,
+                views={split: [frame.view() for frame in capture.split(split)] for split in ALL_SPLITS},
+                config=self.log.config,
+                iteration=iteration,
+                finished=finished,
+                best=best,
+                instead_of_later=instead_of_later,
+            )
 
     def export(self, trainer: Trainer) -> CompactFacts:
         """Write the newest checkpoint as a compact file: its name, its bytes, and its PSNR over all of val."""
-        started = time.perf_counter()
-        size = write_compact(load_model(self.folder), self.folder / MODEL_FILE)
-        psnr = None
-        if self.log.capture.val:
-            scene = read_compact(self.folder / MODEL_FILE).scene
-            psnr = evaluate(scene, self.log.capture.val, self.images, trainer.background).psnr
-        self.log.clock.add("evaluation", time.perf_counter() - started)
-        return CompactFacts(file=MODEL_FILE, bytes=size, psnr=psnr)
+        with self.log.clock.timed("evaluation"):
+            size = write_compact(load_model(self.folder), self.folder / MODEL_FILE)
+            psnr = None
+            if self.log.capture.val:
+                scene = read_compact(self.folder / MODEL_FILE).scene
+                psnr = evaluate(scene, self.log.capture.val, self.images, trainer.background).psnr
+            return CompactFacts(file=MODEL_FILE, bytes=size, psnr=psnr)
 
     def write_metrics(
         self,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from graings.config import TrainConfig
@@ -33,6 +35,14 @@ class Clock:
         """
         self.seconds[phase] = self.seconds.get(phase, 0.0) + seconds
         self.train_cpu_s += cpu_s
+
+    @contextmanager
+    def timed(self, phase: str) -> Iterator[None]:
+        """A context whose time is added to `phase`, and its CPU time if that is a phase of training."""
+        started, computed = time.perf_counter(), time.process_time()
+        yield
+        cpu_s = time.process_time() - computed if phase in TRAINING_PHASES else 0.0
+        self.add(phase, time.perf_counter() - started, cpu_s)
 
     def train_s(self) -> float:
         """Seconds of training alone."""

@@ -122,20 +122,19 @@ class TrainingLog:
 
     def write_run(self) -> None:
         """Write run.json: what is trained, on which capture and with which versions."""
-        started = time.perf_counter()
-        record = RunRecord(
-            capture=CaptureSource(
-                path=self.capture.root.resolve(),
-                hash=self.capture.content_hash,
-                kind=self.capture.kind,
-                notes=self.capture.notes,
-            ),
-            config=self.config,
-            plan=self.plan,
-            versions=self.versions,
-        )
-        write_document(self.folder / RECORD_FILE, record)
-        self.clock.add("report", time.perf_counter() - started)
+        with self.clock.timed("report"):
+            record = RunRecord(
+                capture=CaptureSource(
+                    path=self.capture.root.resolve(),
+                    hash=self.capture.content_hash,
+                    kind=self.capture.kind,
+                    notes=self.capture.notes,
+                ),
+                config=self.config,
+                plan=self.plan,
+                versions=self.versions,
+            )
+            write_document(self.folder / RECORD_FILE, record)
 
     def write_metrics(
         self,
@@ -155,40 +154,39 @@ class TrainingLog:
         `splits` are the metrics of whole splits and `stiffness` is measured over all training views; these two and
         `compact` only exist once the run has ended. Then the plots are always drawn.
         """
-        started = time.perf_counter()
-        metrics = Metrics(
-            splits=dict(splits),
-            train_s=self.clock.train_s(),
-            train_cpu_s=self.clock.train_cpu_s,
-            total_s=self.clock.total_s(),
-            wall_s=self.clock.wall_s(),
-            phases_s=dict(self.clock.seconds),
-            iterations=iteration,
-            iterations_planned=iterations_planned,
-            gaussians=self.gaussians,
-            anchors=scene.scaffold.count,
-            bytes=ModelBytes(fp32=scene_bytes(scene), compact=None if compact is None else compact.bytes),
-            compact=compact,
-            render_fps=render_fps,
-            curve=tuple(self.curve),
-            events=tuple(self.events),
-            plan=self.plan,
-            capture=self._capture_facts(background),
-            skipped_steps=guard.skipped,
-            clipped_steps=guard.clipped,
-            rollbacks=guard.rollbacks,
-            stiffness=None if stiffness is None else _facts(stiffness),
-            diverged=self.diverged is not None,
-            diverged_reason=self.diverged,
-            machine=machine_facts(threads),
-            versions=self.versions,
-            seed=self.config.seed,
-            hashes=Hashes(config=config_hash(self.config), capture=self.capture.content_hash),
-        )
-        write_document(self.folder / METRICS_FILE, metrics)
-        if stiffness is not None or self._plotting_s <= MAX_PLOTTING_SHARE * self.clock.train_s():
-            self._write_plots(metrics)
-        self.clock.add("report", time.perf_counter() - started)
+        with self.clock.timed("report"):
+            metrics = Metrics(
+                splits=dict(splits),
+                train_s=self.clock.train_s(),
+                train_cpu_s=self.clock.train_cpu_s,
+                total_s=self.clock.total_s(),
+                wall_s=self.clock.wall_s(),
+                phases_s=dict(self.clock.seconds),
+                iterations=iteration,
+                iterations_planned=iterations_planned,
+                gaussians=self.gaussians,
+                anchors=scene.scaffold.count,
+                bytes=ModelBytes(fp32=scene_bytes(scene), compact=None if compact is None else compact.bytes),
+                compact=compact,
+                render_fps=render_fps,
+                curve=tuple(self.curve),
+                events=tuple(self.events),
+                plan=self.plan,
+                capture=self._capture_facts(background),
+                skipped_steps=guard.skipped,
+                clipped_steps=guard.clipped,
+                rollbacks=guard.rollbacks,
+                stiffness=None if stiffness is None else _facts(stiffness),
+                diverged=self.diverged is not None,
+                diverged_reason=self.diverged,
+                machine=machine_facts(threads),
+                versions=self.versions,
+                seed=self.config.seed,
+                hashes=Hashes(config=config_hash(self.config), capture=self.capture.content_hash),
+            )
+            write_document(self.folder / METRICS_FILE, metrics)
+            if stiffness is not None or self._plotting_s <= MAX_PLOTTING_SHARE * self.clock.train_s():
+                self._write_plots(metrics)
 
     def _write_plots(self, metrics: Metrics) -> None:
         started = time.perf_counter()

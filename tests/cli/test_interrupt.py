@@ -5,11 +5,18 @@ from __future__ import annotations
 import io
 import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from graings.cli.interrupt import Interrupt
+from graings.storage.run_folder import RECORD_FILE, checkpoints
+from graings.training.run import TrainingRun
+from tests.training.video import write_video
 
 
 class _Interrupted(io.RawIOBase):
@@ -62,3 +69,29 @@ def test_a_signal_is_recorded_also_if_the_reader_of_the_output_has_ended() -> No
         os.dup2(kept, 2)
         os.close(kept)
         os.close(writing)
+
+
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow(reason="a second process for the same path"))],
+)
+def test_a_training_stopped_while_it_looks_for_what_moves_can_be_resumed(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    capture, folder = write_video(tmp_path / "capture", 1.2), tmp_path / "run"
+    command = [sys.executable, "-m", "graings", "train", str(capture), "-o", str(folder), "--set", "iterations=1000"]
+    with subprocess.Popen(
+        [*command, "--preset", "draft", "--threads", "1"], stdout=subprocess.PIPE, text=True
+    ) as process:
+        while not (folder / RECORD_FILE).exists():
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(number)
+        printed, _ = process.communicate()
+    assert process.returncode in (128 + number, -number)
+    assert not checkpoints(folder)
+    if number == signal.SIGINT:
+        assert f"graings train --resume -o {folder}" in printed
+    first = next(iter(TrainingRun.resume(folder)))
+    assert first.iteration == 1
+    assert "motion" in {event.kind for event in first.events}

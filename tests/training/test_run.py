@@ -9,12 +9,13 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from graings.capture.synthetic import write_synthetic
 from graings.config import TrainConfig, make_config
-from graings.errors import CheckpointError
+from graings.errors import CaptureError, CheckpointError
 from graings.raster.photometric import photometric
 from graings.render import low_pass
 from graings.report.evaluate_run import evaluate_run
@@ -24,6 +25,7 @@ from graings.storage.checkpoint import load_model, newest_checkpoint
 from graings.storage.compact import open_model
 from graings.training.held_out import HeldOut
 from graings.training.run import TrainingRun
+from tests.capture.captures import write_image
 
 ITERATIONS = 60
 
@@ -197,6 +199,19 @@ def test_a_run_resumed_from_any_checkpoint_equals_the_unbroken_run_bit_for_bit(
 def test_resuming_without_a_checkpoint_starts_over(capture: Path, tmp_path: Path) -> None:
     TrainingRun.create(capture, tmp_path / "run", _config())
     assert TrainingRun.resume(tmp_path / "run", threads=1).iteration == 0
+
+
+def test_a_run_that_cannot_start_leaves_no_record_so_that_the_mended_capture_can_be_trained(tmp_path: Path) -> None:
+    folder = tmp_path / "capture"
+    write_synthetic(folder, seed=1, frames=4, size=32, bodies=1)
+    whole = {path: path.read_bytes() for path in folder.rglob("*.png")}
+    for path in whole:
+        write_image(path, np.zeros((32, 32, 4)))
+    with pytest.raises(CaptureError, match="every mask is empty"):
+        TrainingRun.create(folder, tmp_path / "run", _config())
+    for path, image in whole.items():
+        path.write_bytes(image)
+    assert TrainingRun.create(folder, tmp_path / "run", _config()).iteration == 0
 
 
 def test_a_resumed_run_keeps_its_options(capture: Path, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ where a new view looks past the surface. Such anchors cost bytes and time, and q
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import torch
@@ -30,13 +29,11 @@ def drop_unseen(trainer: Trainer, log: TrainingLog) -> tuple[Event, ...]:
     least = log.config.density.unseen_pixels
     if least == 0:
         return ()
-    started, computed = time.perf_counter(), time.process_time()
-    keep = largest_contributions(trainer.scene, log.capture.train) >= least
-    removed = int((~keep).sum())
-    if 0 < removed < len(keep):
-        trainer.keep_anchors(keep)
-    phase = trainer.phase(trainer.iteration).name
-    log.clock.add(phase, time.perf_counter() - started, time.process_time() - computed)
+    with log.clock.timed(trainer.phase(trainer.iteration).name):
+        keep = largest_contributions(trainer.scene, log.capture.train) >= least
+        removed = int((~keep).sum())
+        if 0 < removed < len(keep):
+            trainer.keep_anchors(keep)
     return (Unseen(iteration=trainer.run_iteration, anchors=removed),) if 0 < removed < len(keep) else ()
 
 
