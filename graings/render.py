@@ -16,6 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graings.camera.camera import Camera, View
+from graings.camera.frustum import Frustum
+from graings.camera.sampling_rate import SamplingRate
 from graings.gaussians import Gaussians
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
@@ -50,7 +52,10 @@ def render(
     """
     prepared = PreparedScene(scene) if isinstance(scene, Scene) else scene
     with torch.inference_mode():
-        composition = prepared.compose(camera.center, time)
+        if isinstance(prepared, PreparedScene):
+            composition = prepared.compose(camera.center, time, _frustum(prepared.scene, camera, settings))
+        else:
+            composition = prepared.compose(camera.center, time)
         return render_composition(composition, camera, background, settings=settings, depth=depth)
 
 
@@ -140,10 +145,27 @@ def low_pass(composition: Composed, camera: Camera) -> float:
     pixels loses 1 to 8 dB (docs/experiments/): an image of twice the size shows gaps between Gaussians, and distant
     training views widen Gaussians that near views need narrow.
     """
-    if composition.sampling is None:
-        return composition.blur
-    relative_rate = composition.sampling.relative_rate(camera)
-    return composition.blur * relative_rate * relative_rate  # a power would raise where this is infinite
+    return _low_pass(composition.blur, composition.sampling, camera)
+
+
+def _low_pass(blur: float, sampling: SamplingRate | None, camera: Camera) -> float:
+    if sampling is None:
+        return blur
+    relative_rate = sampling.relative_rate(camera)
+    return blur * relative_rate * relative_rate  # a power would raise where this is infinite
+
+
+def _frustum(scene: Scene, camera: Camera, settings: RasterSettings | None) -> Frustum | None:
+    """What `camera` may see of `scene`; None where footprints have no end."""
+    settings = settings or DEFAULT_SETTINGS
+    blur = _low_pass(scene.config.blur, scene.sampling, camera)
+    if settings.alpha_min == 0 or not math.isfinite(blur):
+        return None
+    highest = 1.0 + (0.0 if scene.residual is None else scene.residual.scale)
+    reach = max(3.0, math.sqrt(2.0 * math.log(highest / settings.alpha_min)))
+    return Frustum(
+        camera, near=(1.0 - 1e-6) * settings.near, reach=1.01 * reach, blur=blur, margin=settings.frustum_margin
+    )
 
 
 def contributions(view: Composed, camera: Camera) -> Float[Tensor, " gaussian"]:

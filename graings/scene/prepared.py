@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from graings import constants
+from graings.camera.frustum import Frustum
 from graings.gaussians import Gaussians
 from graings.scene.activations import tanh
 from graings.scene.children import Geometry
@@ -145,8 +146,11 @@ class PreparedScene:
         return self._appearance.colors(eye, self._candidates.slots, None)
 
     @torch.inference_mode()
-    def compose(self, eye: ArrayLike, time: float) -> Composed:
-        """The Gaussians at `time` in [0, 1] for the camera centre `eye` [3] (normalised units)."""
+    def compose(self, eye: ArrayLike, time: float, frustum: Frustum | None = None) -> Composed:
+        """The Gaussians at `time` in [0, 1] for the camera centre `eye` [3] (normalised units).
+
+        With a `frustum`, colours of those that its camera cannot see may be missing: they are 0.
+        """
         instant = self._instant(eye, time)
         rendered, (means, quats, log_scales) = instant.rendered, instant.geometry
         return Composed(
@@ -155,7 +159,7 @@ class PreparedScene:
                 quats=quats,
                 log_scales=log_scales,
                 opacities=rendered.opacities,
-                colors=self._appearance.colors(eye, rendered.slots, instant.changes),
+                colors=self._appearance.colors(eye, rendered.slots, instant.changes, frustum, instant.geometry),
                 uids=rendered.uids,
             ),
             children=rendered.children,

@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from graings import constants, kernel
+from graings.camera.frustum import Frustum
 from graings.scene.appearance import ResidualPart, TemporalHead
 from graings.scene.child_blocks import BLOCK, in_blocks
+from graings.scene.children import Geometry
 from graings.scene.encoding import direction_width, directions_from
 from graings.scene.perceptron import GroupBias
 from graings.scene.scene import Scene
@@ -168,12 +170,17 @@ class PreparedAppearance:
         return Rendered._make(part[:count] for part in found), changes
 
     def colors(
-        self, eye: ArrayLike, children: Int64[Tensor, " gaussian"], changes: Changes | None
+        self,
+        eye: ArrayLike,
+        children: Int64[Tensor, " gaussian"],
+        changes: Changes | None,
+        frustum: Frustum | None = None,
+        geometry: Geometry | None = None,
     ) -> Float[Tensor, "gaussian 3"]:
         """Colours of `children` (ascending slots of these anchors) seen from `eye` [3] at the time of `changes`.
 
-        Equal to the bit to `CanonicalAppearance.colors`, the bounded residual and the clip of `Scene.compose`. Raises
-        `ValueError` for children out of order.
+        Equal to the bit to `CanonicalAppearance.colors`, the bounded residual and the clip of `Scene.compose`. With a
+        `frustum`, those whose `geometry` is outside it may be 0. Raises `ValueError` for children out of order.
         """
         network: tuple[Any, ...] = (0, None, [], [])
         time_only = blended = None
@@ -185,7 +192,10 @@ class PreparedAppearance:
         scale = 0.0 if self._residual is None else self._residual.scale
         colors = self._positions.new_empty(len(children), 3)
         view = (np.asarray(eye, dtype=np.float64).ravel(), constants.NEAR)
-        inputs = (self._positions, *self._canonical, *network, time_only, blended, scale, *view, children)
+        where = (
+            (None, None, None) if frustum is None or geometry is None else (frustum.packed(), geometry[0], geometry[2])
+        )
+        inputs = (self._positions, *self._canonical, *network, time_only, blended, scale, *view, children, *where)
         kernel.kernel().paint(*inputs, colors, kernel.thread_count())
         return colors
 

@@ -25,6 +25,23 @@ void in_pieces(int threads, int64_t count, int64_t size, Body body) {
     parallel_for(threads, (count + size - 1) / size, [&](int worker, int64_t piece) { body(worker, piece * size, std::min(count, (piece + 1) * size)); });
 }
 
+// Whether the frustum's camera may see a child.
+template <class R>
+bool may_see(const Wanted<R>& in, int64_t i) {
+    if (!in.frustum) return true;
+    const Frustum& f = *in.frustum;
+    double away[3], at[3];
+    for (int axis = 0; axis < 3; axis++) away[axis] = double(in.mean[3 * i + axis]) - f.center[axis];
+    for (int axis = 0; axis < 3; axis++) at[axis] = f.rotation[3 * axis] * away[0] + f.rotation[3 * axis + 1] * away[1] + f.rotation[3 * axis + 2] * away[2];
+    if (at[2] < f.near) return false;
+    // In px times the depth; a centre within the image needs no bound of the footprint.
+    const double x = f.fx * at[0] + f.cx * at[2], y = f.fy * at[1] + f.cy * at[2];
+    const double outside = std::max({-x, x - f.width * at[2], -y, y - f.height * at[2]}) - f.constant * at[2];
+    if (!(outside > 0)) return true;
+    const R* scale = in.log_scale + 3 * i;
+    return !(outside > f.spread * std::exp(double(std::max({scale[0], scale[1], scale[2]}))));
+}
+
 // A network with the inputs of a piece of anchors, each a group of its own, and buffers for each worker.
 template <class R>
 struct Head {
@@ -39,19 +56,25 @@ struct Head {
         for (int64_t i = 0; i < kPieceAnchors; i++) numbers[i] = i;
     }
 
-    // Outputs [last - first, outputs] from `input`.
-    void evaluate(int worker, int64_t first, int64_t last, const R* input, R* output) {
+    // Outputs [count, outputs] of the anchors first + chosen[i] from `input`.
+    void evaluate(int worker, int64_t first, int64_t count, const int64_t* chosen, const R* input, R* output) {
         NetworkArgs<R> args = packed.args;
         args.input = input, args.output = output;
-        args.shared += first * args.widths[1], args.groups = numbers;
-        kernels<R>().network_values(args, 0, last - first, scratch.get() + worker * packed.scratch);
+        args.shared += first * args.widths[1], args.groups = chosen;
+        kernels<R>().network_values(args, 0, count, scratch.get() + worker * packed.scratch);
     }
 
-    // The same from encoded directions, in a buffer of the worker.
-    const R* seen(int worker, int64_t first, int64_t last, int degree, const R* directions, const R* normals) {
+    // The same from the directions from `eye` to these anchors, in a buffer of the worker.
+    const R* seen(int worker, int64_t first, int64_t count, const int64_t* chosen, const ColorNetworks<R>& in, const double* eye, double nearest, int degree, const R* normals) {
         R *input = encoded.get() + worker * kPieceAnchors * inputs, *output = raw.get() + worker * kPieceAnchors * outputs;
-        encode_directions(last - first, degree, directions, normals ? normals + 3 * first : nullptr, input, 1);
-        evaluate(worker, first, last, input, output);
+        R towards[3 * kPieceAnchors], normal[3 * kPieceAnchors];
+        for (int64_t i = 0; i < count; i++) {
+            std::copy_n(in.position + 3 * (first + chosen[i]), 3, towards + 3 * i);
+            if (normals) std::copy_n(normals + 3 * (first + chosen[i]), 3, normal + 3 * i);
+        }
+        directions(count, towards, eye, nearest, towards, 1);
+        encode_directions(count, degree, towards, normals ? normal : nullptr, input, 1);
+        evaluate(worker, first, count, chosen, input, output);
         return output;
     }
 };
@@ -82,7 +105,7 @@ int64_t choose(const Shown<R>& in, int64_t slots, const Rendered<R>& out, int th
     if (in.change) {
         Head<R> head(in.residual, threads);
         stride = head.outputs * in.anchors / std::max<int64_t>(slots, 1);
-        in_pieces(threads, in.anchors, kPieceAnchors, [&](int worker, int64_t first, int64_t last) { head.evaluate(worker, first, last, nullptr, in.change + first * head.outputs); });
+        in_pieces(threads, in.anchors, kPieceAnchors, [&](int worker, int64_t first, int64_t last) { head.evaluate(worker, first, last - first, head.numbers, nullptr, in.change + first * head.outputs); });
     }
     const int64_t pieces = (in.count + kPiece - 1) / kPiece;
     Buffer<R> scores{size_t(in.count)};
@@ -130,37 +153,51 @@ void move(const MoveArgs<R>& args, int64_t children, int64_t drawn, int threads)
 }
 
 template <class R>
-void paint(const ColorNetworks<R>& in, const double* eye, double nearest, int64_t drawn, const int64_t* children, R* colors, int threads) {
-    const int64_t slots = in.slots, row = 3 * slots;
+void paint(const ColorNetworks<R>& in, const double* eye, double nearest, const Wanted<R>& wanted, R* colors, int threads) {
+    const int64_t slots = in.slots, row = 3 * slots, drawn = wanted.drawn, *children = wanted.children;
     for (int64_t i = 0; i < drawn; i++)
         if (children[i] < (i ? children[i - 1] + 1 : 0) || children[i] >= in.anchors * slots)
             throw std::invalid_argument("children must be slots of these anchors in ascending order");
     Head<R> canonical(in.canonical, threads);
     std::optional<Head<R>> residual;
     if (in.residual_degree) residual.emplace(in.residual, threads);
-    Buffer<R> towards(size_t(threads * kPieceAnchors * 3)), changes(size_t(threads * kPieceAnchors * row));
+    Buffer<R> buffer(size_t(threads * kPieceAnchors * 2 * row));
     in_pieces(threads, in.anchors, kPieceAnchors, [&](int worker, int64_t first, int64_t last) {
         const int64_t* from = std::lower_bound(children, children + drawn, first * slots);
         const int64_t* to = std::lower_bound(from, children + drawn, last * slots);
-        if (from == to) return;
-        R *direction = towards.get() + worker * kPieceAnchors * 3, *change = changes.get() + worker * kPieceAnchors * row;
-        directions(last - first, in.position + 3 * first, eye, nearest, direction, 1);
-        const R* raw = canonical.seen(worker, first, last, in.degree, direction, in.normals);
-        const R* seen = residual ? residual->seen(worker, first, last, in.residual_degree, direction, nullptr) : nullptr;
-        R* out = colors + 3 * (from - children);
-        for (const int64_t* child = from; child < to; child++) {
-            const int64_t at = *child - first * slots, i = 3 * (child - from);
-            std::copy_n(raw + 3 * at, 3, out + i);
-            if (seen) std::copy_n(seen + 3 * at, 3, change + i);
-            else if (in.time_only) std::copy_n(in.time_only + 4 * *child, 3, change + i);
+        // The anchors with a child that is wanted: the networks see only these.
+        int64_t chosen[kPieceAnchors], count = 0;
+        const int64_t *begins[kPieceAnchors], *ends[kPieceAnchors], *child = from;
+        for (int64_t anchor = first; anchor < last; anchor++) {
+            const int64_t *begin = child, past = (anchor + 1) * slots;
+            bool any = false;
+            for (; child < to && *child < past; child++) any = any || may_see(wanted, child - children);
+            if (any) chosen[count] = anchor - first, begins[count] = begin, ends[count++] = child;
+            else std::fill(colors + 3 * (begin - children), colors + 3 * (child - children), R(0));
         }
+        if (!count) return;
+        const R* raw = canonical.seen(worker, first, count, chosen, in, eye, nearest, in.degree, in.normals);
+        const R* seen = residual ? residual->seen(worker, first, count, chosen, in, eye, nearest, in.residual_degree, nullptr) : nullptr;
+        R *color = buffer.get() + worker * kPieceAnchors * 2 * row, *change = color + kPieceAnchors * row, *c = color, *d = change;
+        for (int64_t i = 0; i < count; i++)
+            for (const int64_t* each = begins[i]; each < ends[i]; each++, c += 3, d += 3) {
+                const int64_t at = i * row + 3 * (*each - (first + chosen[i]) * slots);
+                std::copy_n(raw + at, 3, c);
+                if (in.blended) std::copy_n(in.blended + 3 * (each - children), 3, d);
+                else if (seen) std::copy_n(seen + at, 3, d);
+                else if (in.time_only) std::copy_n(in.time_only + 4 * *each, 3, d);
+            }
+        const int64_t numbers = c - color;
         if (in.blended) {
-            const R* added = in.blended + (out - colors);
-            kernels<R>().activate(kSigmoid, 3 * (to - from), out, out);
-            for (int64_t i = 0; i < 3 * (to - from); i++) out[i] = std::min(std::max(out[i] + added[i], R(0)), R(1));
-            return;
+            kernels<R>().activate(kSigmoid, numbers, color, color);
+            for (int64_t i = 0; i < numbers; i++) color[i] = std::min(std::max(color[i] + change[i], R(0)), R(1));
+        } else
+            kernels<R>().finish_colors(numbers, R(in.bound), seen || in.time_only ? change : nullptr, color);
+        c = color;
+        for (int64_t i = 0; i < count; i++) {
+            const int64_t some = 3 * (ends[i] - begins[i]);
+            std::copy_n(c, some, colors + 3 * (begins[i] - children)), c += some;
         }
-        kernels<R>().finish_colors(3 * (to - from), R(in.bound), seen || in.time_only ? change : nullptr, out);
     });
 }
 
@@ -170,7 +207,7 @@ void paint(const ColorNetworks<R>& in, const double* eye, double nearest, int64_
     template int64_t choose<R>(const Shown<R>&, int64_t, const Rendered<R>&, int);                        \
     template void blend<R>(const BlendArgs<R>&, int64_t, int);                                   \
     template void move<R>(const MoveArgs<R>&, int64_t, int64_t, int);                            \
-    template void paint<R>(const ColorNetworks<R>&, const double*, double, int64_t, const int64_t*, R*, int);
+    template void paint<R>(const ColorNetworks<R>&, const double*, double, const Wanted<R>&, R*, int);
 GRAINGS_INSTANTIATE(float)
 GRAINGS_INSTANTIATE(double)
 #undef GRAINGS_INSTANTIATE

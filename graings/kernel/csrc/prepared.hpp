@@ -63,9 +63,24 @@ struct ColorNetworks {
     double bound;                 // eta
 };
 
-// colors [drawn, 3] of children (anchor * slots + slot) seen from `eye`, Eq. 11 to 13.
+// What a camera can see: see graings/camera/frustum.py, which has these numbers in this order.
+struct Frustum {
+    double rotation[9], center[3], fx, fy, cx, cy, width, height, near, constant, spread;
+};
+
+// The children whose colours are wanted. Without a frustum those of all; else, of the children at mean [drawn, 3] with
+// log_scale [drawn, 3], of those that its camera may see, and at least of these.
+template <class R>
+struct Wanted {
+    int64_t drawn;
+    const int64_t* children;  // anchor * slots + slot, ascending
+    const Frustum* frustum;
+    const R *mean, *log_scale;
+};
+
+// colors [drawn, 3] of the wanted children seen from `eye`, Eq. 11 to 13; 0 for the others.
 // Throws std::invalid_argument when children do not ascend.
 template <class R>
-void paint(const ColorNetworks<R>&, const double* eye, double nearest, int64_t drawn, const int64_t* children, R* colors, int threads);
+void paint(const ColorNetworks<R>&, const double* eye, double nearest, const Wanted<R>&, R* colors, int threads);
 
 }  // namespace graings

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 
 #include "arrays.hpp"
@@ -99,7 +100,8 @@ void bind(nb::module_& m) {
     });
     m.def("paint", [](In<R> position, std::optional<In<R>> normals, int degree, In<R> hidden, std::vector<In<R>> weights, std::vector<In<R>> biases, int residual_degree,
                       std::optional<In<R>> residual_hidden, std::vector<In<R>> residual_weights, std::vector<In<R>> residual_biases, std::optional<In<R>> time_only,
-                      std::optional<In<R>> blended, double bound, In<double> eye, double nearest, In<int64_t> children, Out<R> colors, int threads) {
+                      std::optional<In<R>> blended, double bound, In<double> eye, double nearest, In<int64_t> children, std::optional<In<double>> frustum,
+                      std::optional<In<R>> mean, std::optional<In<R>> log_scale, Out<R> colors, int threads) {
         const int64_t anchors = int64_t(position.size() / 3);
         graings::ColorNetworks<R> in{anchors, 0, position.data(), checked(normals, position.size(), "normals"), degree, {}, residual_degree, {}, nullptr, nullptr, bound};
         in.canonical = head(hidden, anchors, weights, biases, harmonics_of(degree) * (normals ? 2 : 1));
@@ -114,8 +116,14 @@ void bind(nb::module_& m) {
         in.blended = checked(blended, 3 * children.size(), "blended");
         const double* from = checked(eye, 3, "eye");
         R* out = checked(colors, 3 * children.size(), "colors");
+        graings::Frustum seen{};
+        static_assert(sizeof seen == 21 * sizeof(double));
+        if (const double* numbers = checked(frustum, 21, "frustum")) std::memcpy(&seen, numbers, sizeof seen);
+        const graings::Wanted<R> wanted{int64_t(children.size()), children.data(), frustum ? &seen : nullptr, checked(mean, 3 * children.size(), "mean"),
+                                        checked(log_scale, 3 * children.size(), "log_scale")};
+        if (frustum && !(mean && log_scale)) throw std::invalid_argument("a frustum needs mean and log_scale");
         nb::gil_scoped_release release;
-        graings::paint<R>(in, from, nearest, int64_t(children.size()), children.data(), out, threads);
+        graings::paint<R>(in, from, nearest, wanted, out, threads);
     });
 }
 
