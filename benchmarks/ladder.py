@@ -46,7 +46,10 @@ ROWS = (
     Row(
         "anchors",
         "anchors fixed, scales relative, new anchors as opaque as their parent",
-        ("scene.learnable_anchors", "scene.relative_scales", "density.new_anchor_opacity"),
+        (
+            *("scene.learnable_anchors", "scene.relative_scales"),
+            *("density.new_anchor_opacity", "scene.child_opacity_offsets"),
+        ),
     ),
     Row(
         "opacity",

@@ -29,6 +29,7 @@ def tiny_scene(
         log_scales=torch.full((anchors, 3), -2.5) + 0.1 * torch.randn(anchors, 3),
         features=torch.randn(anchors, settings.feature_dim),
         offsets=torch.randn(anchors, settings.children, 3) * 0.3,
+        opacity_offsets=torch.zeros(anchors, settings.children) if settings.child_opacity_offsets else None,
     )
     scene = Scene(settings, scaffold, extent=1.0, sampling=SAMPLING, initial_opacity=0.3)
     if trained:

@@ -41,6 +41,7 @@ PRINTED: Final[tuple[tuple[str, str, str, Any], ...]] = (
     ("Eq. 5: rho_can is StaticMLP's alone", SCAFFOLD, "scene.relative_scales", False),
     ("Eq. 5: a StaticMLP", SCAFFOLD, "scene.canonical", True),
     ("new anchors start with low opacity", SCAFFOLD, "density.new_anchor_opacity", 0.1),
+    ("all of their children do", SCAFFOLD, "scene.child_opacity_offsets", True),
     ("warm-up views are sampled from all times", SCAFFOLD, "time_window", 1.0),
     ("Eq. 7: offsets of each Gaussian", DEFORMATION, "scene.deformation", "child"),
     ("Eq. 7: sg(x_can)", DEFORMATION, "scene.stop_gradient", True),

@@ -31,7 +31,8 @@ class DensityConfig(ConfigSection):
         None,
         gt=0.004,
         lt=0.99,
-        description="Initial opacity of a new anchor's most opaque child; null: that of the parent.",
+        description="Initial opacity of a new anchor's most opaque child, or of all its children with "
+        "`scene.child_opacity_offsets`; null: that of the parent.",
     )
     max_growth: float | None = Field(
         0.1,
@@ -80,7 +81,7 @@ class RatesConfig(ConfigSection):
         "positions in 3DGS.",
     )
     opacity_offsets: FirstAndLast = Field(
-        (0.02, 0.002), description="Offset that an anchor adds to the opacity logits of its children."
+        (0.02, 0.002), description="Offsets of the opacity logits of an anchor's children."
     )
     static: FirstAndLast = Field((0.004, 0.0004), description="StaticMLP.")
     color: FirstAndLast = Field(

@@ -64,6 +64,7 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
             "color_sh_degree": 1,
             "reflection": False,
             "opacity_view": True,
+            "child_opacity_offsets": True,
             "projected_clip": False,
             "blur": 0.3,
         },

@@ -141,6 +141,9 @@ class SceneConfig(ConfigSection):
         "other views use the same width in the scene. A pixel's box filter has 1/12; 3DGS uses 0.3.",
     )
     opacity_view: bool = Field(False, description="Give the opacity head the viewing direction, as in the paper.")
+    child_opacity_offsets: bool = Field(
+        False, description="Learn an offset of the opacity logit for each child instead of one for each anchor."
+    )
     projected_clip: bool = Field(
         True, description="Let clipped values receive gradients that move them back into their range."
     )

@@ -63,7 +63,7 @@ class PreparedScene:
         shown = possible_children(scene)
         self._anchors = shown.any(1).nonzero().squeeze(-1)
         self._features = scaffold.features.index_select(0, self._anchors)
-        self._opacity_offsets = scaffold.opacity_offsets.index_select(0, self._anchors).unsqueeze(-1)
+        self._opacity_offsets = scaffold.slot_opacity_offsets.index_select(0, self._anchors)
         self._opacities = (
             None
             if scene.config.opacity_view
@@ -206,5 +206,5 @@ def possible_children(scene: Scene) -> Bool[Tensor, "anchor child"]:
             logits = logits + scene.appearance.opacity_rounding(scaffold.features)
         else:
             logits = scene.appearance.opacity_logits(scaffold.features, scaffold.anchors)  # which has no direction
-        highest = tanh(logits + scaffold.opacity_offsets.unsqueeze(-1))
+        highest = tanh(logits + scaffold.slot_opacity_offsets)
         return highest + (0.0 if residual is None else residual.scale) > constants.ALPHA_MIN

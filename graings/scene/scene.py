@@ -186,7 +186,7 @@ class Scene(nn.Module):
 
     def _canonical_opacities(self, directions: Sequence[Tensor]) -> list[Tensor]:
         """o_can [A, k] of every slot for each view, Eq. 11."""
-        offsets = self.scaffold.opacity_offsets.unsqueeze(-1)
+        offsets = self.scaffold.slot_opacity_offsets
         scores: list[Tensor] = []
         for direction in directions:
             if not scores or self.config.opacity_view:

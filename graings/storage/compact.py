@@ -23,7 +23,7 @@ from torch import Tensor
 
 from graings import constants
 from graings.errors import CheckpointError
-from graings.scene.scaffold import Scaffold
+from graings.scene.scaffold import Scaffold, per_slot
 from graings.scene.scene import Scene
 from graings.storage.checkpoint import load_model
 from graings.storage.files import write_bytes
@@ -120,12 +120,14 @@ def open_model(path: Path) -> Model:
 
 
 def can_be_seen(
-    scene: Scene, features: Float[Tensor, "anchor feature"], opacity_offsets: Float[Tensor, " anchor"]
+    scene: Scene,
+    features: Float[Tensor, "anchor feature"],
+    opacity_offsets: Float[Tensor, " anchor"] | Float[Tensor, "anchor child"],
 ) -> Bool[Tensor, " anchor"]:
     """Which anchors have a child that may be drawn at some time from some camera; the others never change a pixel."""
     with torch.no_grad():
         logits = scene.appearance.highest_opacity_logits(features)
-        highest = torch.tanh(logits + opacity_offsets.unsqueeze(-1)).amax(-1)
+        highest = torch.tanh(logits + per_slot(opacity_offsets)).amax(-1)
     # The residual of opacity is bounded; one hundredth more covers rounding.
     reach = 1.01 * scene.residual.scale if scene.residual is not None else 0.0
     return highest > constants.ALPHA_MIN - reach

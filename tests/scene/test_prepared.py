@@ -42,6 +42,8 @@ CONFIGS: list[dict[str, Any]] = [
     {"reflection": False},
     {"reflection": False, "residual": False, "color_sh_degree": 2},
     {"opacity_view": True},
+    {"child_opacity_offsets": True},
+    {"child_opacity_offsets": True, "opacity_view": True},
     {"relative_scales": False, "learnable_anchors": True},
     {"relative_scales": False, "time_conditioning": "concatenated"},
     {"projected_clip": False, "children": 1},

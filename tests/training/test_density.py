@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 
 from graings.config import DensityConfig, TrainConfig
@@ -146,6 +147,25 @@ def test_new_anchors_are_faint_or_inherit_their_opacity_as_configured() -> None:
     assert torch.equal(new_anchor_opacity_offsets(scaffold, logits, parents, None), scaffold.opacity_offsets[parents])
     fainter = new_anchor_opacity_offsets(scaffold, logits - 3.0, parents, 0.05)
     assert torch.equal(fainter, scaffold.opacity_offsets.detach()[parents])
+
+
+def test_with_an_offset_for_each_child_all_children_of_a_new_anchor_start_faint() -> None:
+    scaffold = tiny_scene().scaffold
+    own = torch.randn(scaffold.count, 3)
+    scaffold = Scaffold(scaffold.anchors, scaffold.log_scales.data, scaffold.features.data, scaffold.offsets.data, own)
+    network = torch.randn(scaffold.count, 3)
+    parents = torch.tensor([0, 5])
+    faint = new_anchor_opacity_offsets(scaffold, network + own, parents, 0.1)
+    torch.testing.assert_close(torch.tanh(network[parents] + faint), torch.full((2, 3), 0.1))
+    assert torch.equal(new_anchor_opacity_offsets(scaffold, network + own, parents, None), own[parents])
+
+
+@pytest.mark.parametrize("shape", [(19,), (20, 2), (20, 3, 1), ()])
+def test_opacity_offsets_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    scaffold = tiny_scene().scaffold
+    rows = (scaffold.anchors, scaffold.log_scales.data, scaffold.features.data, scaffold.offsets.data)
+    with pytest.raises(ValueError, match="opacity_offsets"):
+        Scaffold(*rows, torch.zeros(shape))
 
 
 def test_pruning_removes_only_well_observed_faint_anchors() -> None:

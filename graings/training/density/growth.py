@@ -126,16 +126,18 @@ def new_anchor_opacity_offsets(
     logits: Float[Tensor, "anchor child"],
     parents: Int64[Tensor, " new"],
     opacity: float | None,
-) -> Float[Tensor, " new"]:
-    """Opacity offsets that make the brightest child of each new anchor start at most at `opacity`.
+) -> Float[Tensor, " new"] | Float[Tensor, "new child"]:
+    """Opacity offsets of new anchors.
 
-    None inherits the parent's offset as it is.
+    With an offset for each child, each child starts at `opacity`; with one for each anchor the most opaque child does,
+    or lower where its parent is. None inherits the parent's offsets as they are.
     """
     inherited = scaffold.opacity_offsets.detach()[parents]
     if opacity is None:
         return inherited
-    # `logits` contain the parent's offset, so the correction adds to it.
-    return inherited + (math.atanh(opacity) - logits[parents].amax(-1)).clamp_max(0.0)
+    # `logits` contain the parent's offsets, so the correction adds to them.
+    missing = math.atanh(opacity) - logits[parents]
+    return inherited + (missing if inherited.dim() == 2 else missing.amin(-1).clamp_max(0.0))
 
 
 def prune(scaffold: Scaffold, statistics: DensityStatistics, config: DensityConfig) -> Bool[Tensor, " anchor"]:

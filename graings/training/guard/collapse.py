@@ -67,7 +67,7 @@ def mean_logits(scene: Scene) -> Float[Tensor, "anchor child"]:
     with torch.no_grad():
         mean_direction = torch.zeros_like(scene.scaffold.anchors)
         logits = scene.appearance.opacity_logits(scene.scaffold.features, mean_direction)
-        return logits + scene.scaffold.opacity_offsets.unsqueeze(-1)
+        return logits + scene.scaffold.slot_opacity_offsets
 
 
 def raise_opacity(scene: Scene) -> float:

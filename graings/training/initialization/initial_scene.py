@@ -102,6 +102,7 @@ def make_scene(
         log_scales=torch.from_numpy(np.log(spacing)).float().unsqueeze(-1).repeat(1, 3),
         features=torch.randn(count, scene.feature_dim, generator=generator) * FEATURE_STD,
         offsets=torch.randn(count, scene.children, 3, generator=generator) * config.init.offset_std,
+        opacity_offsets=torch.zeros(count, scene.children) if scene.child_opacity_offsets else None,
     )
     made = Scene(
         scene,
