@@ -27,9 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Page, sync_playwright
 
+from graings.camera.camera import Camera
 from graings.capture.image_file import decode
 from graings.evaluation.metrics import psnr
 from graings.export.export import ExportRequest, export_splats
+from graings.export.harmonics_fit import spread
+from graings.player.capture_cameras import MOST
 from graings.player.html import player_html
 from graings.player.scene_file import scene_bytes
 from graings.render import PreparedScene, render
@@ -172,10 +175,17 @@ def exact(model: Model, prepared: PreparedScene, index: int, time: float) -> NDA
     return found
 
 
-def chosen(model: Model) -> list[int]:
-    """Three training views."""
-    count = len(model.views["train"])
-    return [0, count // 3, 2 * count // 3]
+def camera_pose(model: Model, camera: Camera, suffix: str) -> NDArray[np.float64]:
+    """Camera to world [4, 4] in the axes of the file: those of .spz are turned by half about x."""
+    turned = np.diag([1.0, -1.0, -1.0, 1.0]) if suffix == ".spz" else np.eye(4)
+    pose: NDArray[np.float64] = turned @ np.linalg.inv(model.units.camera_back(camera))
+    return pose
+
+
+def chosen(model: Model) -> list[tuple[int, int]]:
+    """Three training views: their places in the page's list of cameras, and in the model's views."""
+    listed = spread(len(model.views["train"]), MOST["train"])
+    return [(place, listed[place]) for place in (0, len(listed) // 3, 2 * len(listed) // 3)]
 
 
 def our_row(page: Page, model: Model, name: str, folder: Path, px: int, frames: int) -> str:
@@ -190,8 +200,8 @@ def our_row(page: Page, model: Model, name: str, folder: Path, px: int, frames: 
     page.get_by_role("button", name="Pause").click()
     prepared = PreparedScene(model.scene)
     found = [
-        psnr(image(page.evaluate(OURS, [i, t, px, 0])["picture"], folder), exact(model, prepared, i, t))
-        for i in chosen(model)
+        psnr(image(page.evaluate(OURS, [place, t, px, 0])["picture"], folder), exact(model, prepared, index, t))
+        for place, index in chosen(model)
         for t in TIMES
     ]
     timed = page.evaluate(OURS, [0, TIMES[1], px, frames])
@@ -212,9 +222,9 @@ def spark_row(
         (folder / f"{number}{suffix}").write_bytes(exported.data)
         sizes.append(len(exported.data))
         count = exported.splats
-        for index in chosen(model):
+        for _, index in chosen(model):
             camera = model.views["train"][index].camera
-            pose = np.linalg.inv(model.units.camera_back(camera))
+            pose = camera_pose(model, camera, suffix)
             view = {"pose": pose.ravel().tolist(), "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
             ask = {
                 "url": f"{address}/{number}{suffix}",
@@ -228,7 +238,7 @@ def spark_row(
     camera = model.views["train"][0].camera
     scale = px / max(camera.width, camera.height)
     wide = camera.resized(round(scale * camera.width), round(scale * camera.height))
-    pose = np.linalg.inv(model.units.camera_back(camera))
+    pose = camera_pose(model, camera, suffix)
     view = {"pose": pose.ravel().tolist(), "fx": wide.fx, "fy": wide.fy, "cx": wide.cx, "cy": wide.cy}
     ask = {
         "url": f"{address}/1{suffix}",

@@ -6,7 +6,7 @@ PyAV (extra `video`) brings FFmpeg's encoders. A name without a suffix is a fold
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -73,11 +73,17 @@ def write_video(
     width, height = (side - side % 2 if even else side for side in (frames[0][0].width, frames[0][0].height))
     if min(width, height) < 1:
         raise ValueError(f"{path.suffix} needs at least 2 x 2 pixels")
-    with _folder(path) if codec is None else _encoder(path, codec, width, height, fps) as add:
+    with video_file(path, width, height, fps) as add:
         for index, (camera, time) in enumerate(frames):
             color = render(shown.scene, camera.resized(width, height), time, background).color.numpy()
             add(np.rint(np.clip(color, 0.0, 1.0) * 255.0).astype(np.uint8))
             observe(index + 1)
+
+
+def video_file(path: Path, width: int, height: int, fps: float) -> AbstractContextManager[Callable[[Levels], None]]:
+    """A context with a function that adds a frame [height, width, 3] to the video at `path`, whole at its end."""
+    codec = CODECS.get(path.suffix.lower())
+    return _folder(path) if codec is None else _encoder(path, codec, width, height, fps)
 
 
 @contextmanager
