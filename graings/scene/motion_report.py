@@ -52,7 +52,7 @@ class MotionBasisReport(Document):
         """The errors in one line of text."""
         moved, seen = self.geometry.error, self.residual.error
         return (
-            f"{self.geometry.rank} functions of time for {self.geometry.children} of {self.children} Gaussians: within "
-            f"{moved.p99:.2g} px for 99 % (RMS {moved.rms:.2g}, largest {moved.max:.2g}), residual within "
-            f"{seen.p99:.2g} grey levels"
+            f"{self.geometry.rank} functions of time for {self.geometry.children} of {self.children} Gaussians: in the "
+            f"training views within {moved.p99:.2g} px for 99 % (RMS {moved.rms:.2g}, largest {moved.max:.2g}), "
+            f"residual within {seen.p99:.2g} grey levels"
         )
