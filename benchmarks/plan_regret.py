@@ -88,9 +88,9 @@ def decode_copy(file: Path) -> np.ndarray:
 
 
 def write_noisy(pixels: np.ndarray, path: Path, random: np.random.Generator) -> None:
-    """Composite on white, add noise and write 8 bits, opaque."""
+    """Composite on white, add noise and write 8 bits, opaque. Contrast is lower, so that no noise is clipped."""
     rgb = pixels[..., :3] + (1 - pixels[..., 3:]) if pixels.shape[-1] == 4 else pixels
-    noisy = np.clip(rgb + random.normal(0, NOISE, rgb.shape), 0, 1)
+    noisy = np.clip(0.1 + 0.8 * rgb + random.normal(0, NOISE, rgb.shape), 0, 1)
     output = oiio.ImageOutput.create(str(path))
     output.open(str(path), oiio.ImageSpec(rgb.shape[1], rgb.shape[0], 3, "uint8"))
     output.write_image(np.rint(255 * noisy).astype(np.uint8))
