@@ -80,9 +80,13 @@ def test_a_training_stopped_while_it_looks_for_what_moves_can_be_resumed(
 ) -> None:
     capture, folder = write_video(tmp_path / "capture", 1.2), tmp_path / "run"
     command = [sys.executable, "-m", "graings", "train", str(capture), "-o", str(folder), "--set", "iterations=1000"]
-    with subprocess.Popen(
-        [*command, "--preset", "draft", "--threads", "1"], stdout=subprocess.PIPE, text=True
-    ) as process:
+    command += ["--preset", "draft", "--threads", "1"]
+
+    def heed() -> None:
+        """A shell without job control starts what runs in the background, and its children, with SIGINT ignored."""
+        signal.signal(number, signal.SIG_DFL)
+
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heed) as process:
         while not (folder / RECORD_FILE).exists():
             assert process.poll() is None
             time.sleep(0.01)
