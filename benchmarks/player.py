@@ -175,13 +175,6 @@ def exact(model: Model, prepared: PreparedScene, index: int, time: float) -> NDA
     return found
 
 
-def camera_pose(model: Model, camera: Camera, suffix: str) -> NDArray[np.float64]:
-    """Camera to world [4, 4] in the axes of the file: those of .spz are turned by half about x."""
-    turned = np.diag([1.0, -1.0, -1.0, 1.0]) if suffix == ".spz" else np.eye(4)
-    pose: NDArray[np.float64] = turned @ np.linalg.inv(model.units.camera_back(camera))
-    return pose
-
-
 def chosen(model: Model) -> list[tuple[int, int]]:
     """Three training views: their places in the page's list of cameras, and in the model's views."""
     listed = spread(len(model.views["train"]), MOST["train"])
@@ -216,6 +209,17 @@ def spark_row(
     page: Page, model: Model, name: str, suffix: str, folder: Path, address: str, px: int, frames: int
 ) -> str:
     prepared = PreparedScene(model.scene)
+
+    def drawn(number: int, camera: Camera, frames: int) -> dict[str, Any]:
+        pose = np.linalg.inv(model.units.camera_back(camera))
+        if suffix == ".spz":  # its axes are turned by half about x
+            pose = np.diag([1.0, -1.0, -1.0, 1.0]) @ pose
+        view = {"pose": pose.ravel().tolist(), "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        view |= {"width": camera.width, "height": camera.height}
+        ask = {"url": f"{address}/{number}{suffix}", "view": view, "background": model.background, "frames": frames}
+        answer: dict[str, Any] = page.evaluate("drawn", ask)
+        return answer
+
     found, sizes, first, count = [], [], 0.0, 0
     for number, time in enumerate(TIMES):
         exported = export_splats(model, ExportRequest(suffix[1:], time=time))
@@ -223,30 +227,12 @@ def spark_row(
         sizes.append(len(exported.data))
         count = exported.splats
         for _, index in chosen(model):
-            camera = model.views["train"][index].camera
-            pose = camera_pose(model, camera, suffix)
-            view = {"pose": pose.ravel().tolist(), "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-            ask = {
-                "url": f"{address}/{number}{suffix}",
-                "view": view | {"width": camera.width, "height": camera.height},
-                "background": list(model.background),
-                "frames": 0,
-            }
-            drawn = page.evaluate("drawn", ask)
-            first = first or drawn["first"]
-            found.append(psnr(image(drawn["picture"], folder), exact(model, prepared, index, time)))
+            answer = drawn(number, model.views["train"][index].camera, 0)
+            first = first or answer["first"]
+            found.append(psnr(image(answer["picture"], folder), exact(model, prepared, index, time)))
     camera = model.views["train"][0].camera
     scale = px / max(camera.width, camera.height)
-    wide = camera.resized(round(scale * camera.width), round(scale * camera.height))
-    pose = camera_pose(model, camera, suffix)
-    view = {"pose": pose.ravel().tolist(), "fx": wide.fx, "fy": wide.fy, "cx": wide.cx, "cy": wide.cy}
-    ask = {
-        "url": f"{address}/1{suffix}",
-        "view": view | {"width": wide.width, "height": wide.height},
-        "background": list(model.background),
-        "frames": frames,
-    }
-    timed = page.evaluate("drawn", ask)
+    timed = drawn(1, camera.resized(round(scale * camera.width), round(scale * camera.height)), frames)
     modules = folder / "modules"
     code = sum(
         (modules / file).stat().st_size

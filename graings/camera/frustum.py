@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
 
-# Added to every footprint, in px: footprints of `RasterSettings.compat` end at whole tiles.
-TILE: Final = 16.0
+# Added to every footprint, in px: those of `RasterSettings.compat` are rounded up and end at whole tiles of 16 px.
+SLACK: Final = 18.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +47,6 @@ class Frustum:
                 camera.world_to_camera[:3, :3].ravel(),
                 camera.center,
                 (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
-                (self.near, self.reach * math.sqrt(self.blur) + TILE + 2.0, self.reach * spread),
+                (self.near, self.reach * math.sqrt(self.blur) + SLACK, self.reach * spread),
             ]
         )
