@@ -47,6 +47,12 @@ def best_checkpoint(run: Path) -> Path | None:
     return folder if (folder / FACTS_FILE).is_file() else None
 
 
+def check_unused(run: Path) -> None:
+    """Raises `CheckpointError` when the folder holds a run."""
+    if (run / RECORD_FILE).exists():
+        raise CheckpointError(f"{run}: already holds a run. Resume it (--resume) or choose another folder.")
+
+
 @contextmanager
 def sole_trainer(run: Path) -> Iterator[None]:
     """Lock a run folder for one trainer. Raises `CheckpointError` when another process of this machine has the lock."""

@@ -31,7 +31,7 @@ from graings.storage.checkpoint import (
     load_training,
     newest_checkpoint,
 )
-from graings.storage.run_folder import RECORD_FILE, sole_trainer
+from graings.storage.run_folder import RECORD_FILE, check_unused, sole_trainer
 from graings.training.curriculum.missing_motion import MissingMotion, check_iteration
 from graings.training.curriculum.restart import RestartState
 from graings.training.density.unseen import drop_unseen
@@ -80,8 +80,7 @@ class TrainingRun:
 
         Raises `CaptureError` for the capture and `CheckpointError` for the folder.
         """
-        if (folder / RECORD_FILE).exists():
-            raise CheckpointError(f"{folder}: already holds a run. Resume it (--resume) or choose another folder.")
+        check_unused(folder)
         clock = Clock()
         with clock.timed("load"):
             data = load_capture(capture, config.capture)
@@ -89,8 +88,10 @@ class TrainingRun:
             run = cls(folder, data, config, None, clock)
         # Written first: what crosses a video is searched for up to a minute, and an interrupted search can be resumed.
         folder.mkdir(parents=True, exist_ok=True)
-        run.log.write_run()
-        run.revision.write()
+        with sole_trainer(folder):
+            check_unused(folder)  # another may have begun here meanwhile
+            run.log.write_run()
+            run.revision.write()
         try:
             run._start()
         except GraingsError:

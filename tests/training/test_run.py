@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import torch
 
+from graings.capture.capture import Capture
+from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
 from graings.config import TrainConfig, make_config
 from graings.errors import CaptureError, CheckpointError
@@ -21,6 +23,7 @@ from graings.render import low_pass
 from graings.report.evaluate_run import evaluate_run
 from graings.report.machine import version_facts
 from graings.report.metrics_document import read_metrics
+from graings.report.run_record import read_record
 from graings.storage.checkpoint import load_model, newest_checkpoint
 from graings.storage.compact import open_model
 from graings.training.held_out import HeldOut
@@ -259,6 +262,25 @@ def test_a_folder_with_a_run_is_not_overwritten(capture: Path, tmp_path: Path) -
     TrainingRun.create(capture, tmp_path / "run", _config())
     with pytest.raises(CheckpointError, match="already holds a run"):
         TrainingRun.create(capture, tmp_path / "run", _config())
+
+
+def test_of_two_runs_begun_at_once_in_one_folder_the_second_leaves_the_first_as_it_is(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+
+    def load_while_another_begins(*arguments: Any) -> Capture:
+        loaded = load_capture(*arguments)
+        if not (folder / "run.json").exists():
+            monkeypatch.undo()
+            TrainingRun.create(capture, folder, _config(seed=1))
+        return loaded
+
+    monkeypatch.setattr("graings.training.run.load_capture", load_while_another_begins)
+    with pytest.raises(CheckpointError, match="already holds a run"):
+        TrainingRun.create(capture, folder, _config(seed=2))
+    assert read_record(folder).config.seed == 1
+    assert next(iter(TrainingRun.resume(folder))).iteration == 1
 
 
 def test_another_capture_is_refused_on_resume(capture: Path, tmp_path: Path) -> None:
