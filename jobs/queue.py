@@ -15,10 +15,11 @@ from pathlib import Path
 from time import time
 from typing import Any, Final
 
+from graings.storage.run_folder import MODEL_FILE, PLAN_FILE
 from jobs.engine import Engine, QueueEntry
 from jobs.job import Attempt, Job, JobConflict, JobDamaged, JobNotFound, JobSpec, JobState
 from jobs.progress import last_progress
-from jobs.store import Store
+from jobs.store import CURVE_FILE, METRICS_FILE, Store
 from jobs.webhooks import message
 
 LOG = logging.getLogger(__name__)
@@ -186,6 +187,7 @@ class JobQueue:
         except JobDamaged as damage:
             # A damaged file must neither hide the other jobs nor prevent the deletion of this one.
             state, error = JobState.FAILED if entry is None else state, str(damage)
+        files = folder.run_files()
         return Job(
             id=job_id,
             spec=spec,
@@ -195,10 +197,10 @@ class JobQueue:
             finished_at=None if entry is None else entry.finished_at,
             attempts=attempts[-1].number if attempts else 0,
             progress=last_progress(folder.progress),
-            checkpoint=folder.checkpoint(),
-            has_metrics=folder.metrics.exists(),
-            has_curve=folder.curve.exists(),
-            has_plan=folder.plan.exists(),
-            has_model=folder.model.exists(),
+            checkpoint=folder.checkpoint() if files else None,
+            has_metrics=METRICS_FILE in files,
+            has_curve=CURVE_FILE in files,
+            has_plan=PLAN_FILE in files,
+            has_model=MODEL_FILE in files,
             error=error,
         )

@@ -40,6 +40,8 @@ from jobs.job import (
 from jobs.locks import locked
 
 KEPT_ATTEMPTS = 50
+METRICS_FILE = "metrics.json"
+CURVE_FILE = "curve.svg"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,7 @@ class JobFolder:
 
     @property
     def metrics(self) -> Path:
-        return self.run / "metrics.json"
+        return self.run / METRICS_FILE
 
     @property
     def plan(self) -> Path:
@@ -79,7 +81,7 @@ class JobFolder:
 
     @property
     def curve(self) -> Path:
-        return self.run / "curve.svg"
+        return self.run / CURVE_FILE
 
     @property
     def report(self) -> Path:
@@ -114,6 +116,13 @@ class JobFolder:
     def created_at(self) -> float:
         """Unix seconds, which are the first part of the id."""
         return int(self.path.name[:11], 16) / 1000.0
+
+    def run_files(self) -> frozenset[str]:
+        """Names of the files and folders of the run; none before the training has begun."""
+        try:
+            return frozenset(os.listdir(self.run))
+        except FileNotFoundError:
+            return frozenset()
 
     def checkpoint(self) -> int | None:
         """The iteration of the newest checkpoint, or None."""
