@@ -40,7 +40,7 @@ from graings.camera.camera import Camera
 from graings.image_encoding import encode_image
 from graings.raster.rasterize import rasterize
 from graings.raster.result import RasterSettings
-from graings.render import fast_scene, low_pass, render, render_composition
+from graings.render import FastScene, low_pass, render, render_composition
 from graings.scene.prepared import PreparedScene
 from graings.storage.compact import open_model
 from graings.storage.model import Model
@@ -92,7 +92,7 @@ def measured(model: Model, name: str, px: int, threads: int, rounds: int, before
             raster.of(
                 lambda: rasterize(composed.gaussians, camera, background, settings=settings, depth=False), counted
             )
-        approximated.of(lambda: render(fast, camera, moment, model.background), counted)
+        approximated.of(lambda: render(fast.seen_by(camera), camera, moment, model.background), counted)
         orbit.of(lambda: render(prepared, other, moment, model.background), counted)
         encoded.of(lambda: encode_image(np.asarray(image.color), "png"), counted)
         gaussians = max(gaussians, len(composed.gaussians))
@@ -115,7 +115,7 @@ def measured(model: Model, name: str, px: int, threads: int, rounds: int, before
 
     prepared = first.of(first_view)
     started = time.perf_counter()
-    fast, _ = fast_scene(prepared, model.views["train"])
+    fast = FastScene.of(prepared, model.views["train"])
     fast_first_s = time.perf_counter() - started
     for number in range(-WARM_UPS, rounds):
         one_round(number + WARM_UPS, number >= 0)

@@ -15,21 +15,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from graings.camera.camera import Camera, View
+from graings.camera.camera import Camera
 from graings.camera.frustum import Frustum
 from graings.camera.sampling_rate import SamplingRate
 from graings.gaussians import Gaussians
 from graings.raster.rasterize import rasterize
 from graings.raster.result import DEFAULT_SETTINGS, RasterSettings, RenderResult
-from graings.scene.motion_basis import MotionBasis
-from graings.scene.motion_report import MotionBasisReport as MotionBasisReport
+from graings.scene.fast_scene import FastScene as FastScene
 from graings.scene.prepared import PreparedScene as PreparedScene  # part of this module's interface too
 from graings.scene.scene import Composed, Scene
 from graings.scene.splats import Splats
-
-# Errors of fast images, for 99 % of the children and times: in the training views, and in grey levels.
-FAST_PIXELS: Final = 0.2
-FAST_LEVELS: Final = 1.0
 
 # Upper bound of the supersampled image: four pixels for each of 1920 x 1080, in 200 MB.
 MAX_SUPERSAMPLED_PIXELS: Final = 1 << 23
@@ -57,15 +52,6 @@ def render(
         else:
             composition = prepared.compose(camera.center, time)
         return render_composition(composition, camera, background, settings=settings, depth=depth)
-
-
-def fast_scene(prepared: PreparedScene, views: Sequence[View]) -> tuple[PreparedScene, MotionBasisReport]:
-    """`prepared` with its motion by a basis of functions of time, within FAST_PIXELS in the training `views`.
-
-    Its images take less time and differ a little from the exact ones: by what the report says.
-    """
-    basis = MotionBasis.of(prepared, views, pixels=FAST_PIXELS, levels=FAST_LEVELS)
-    return basis.prepared(prepared), basis.report
 
 
 def render_composition(

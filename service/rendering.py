@@ -21,7 +21,7 @@ from graings.camera.camera import Camera
 from graings.errors import CheckpointError
 from graings.export.picture import Content, picture
 from graings.image_encoding import ImageFormat
-from graings.render import MotionBasisReport, PreparedScene, fast_scene
+from graings.render import FastScene, PreparedScene
 from graings.storage.compact import open_model
 from graings.storage.model import Model, scene_bytes
 from graings.storage.run_folder import newest_model
@@ -36,7 +36,7 @@ NICE = 5
 class RenderRequest:
     """Everything an image depends on, except the model. `time` is in [0, 1], `background` is RGB in [0, 1].
 
-    `fast` approximates the motion (`graings.render.fast_scene`).
+    `fast` approximates the motion (`graings.render.FastScene`).
     """
 
     camera: Camera
@@ -60,20 +60,20 @@ class LoadedModel:
 
     def __init__(self, model: Model, scene: PreparedScene) -> None:
         self.model, self.scene = model, scene
-        self._fast: tuple[PreparedScene, MotionBasisReport] | None = None
+        self._fast: FastScene | None = None
         self._guard = threading.Lock()
 
     @property
     def bytes(self) -> int:
         """Memory that it takes."""
-        fast = 0 if self._fast is None else self._fast[0].bytes
+        fast = 0 if self._fast is None else self._fast.approximate.bytes
         return scene_bytes(self.model.scene) + self.scene.bytes + fast
 
-    def fast(self) -> tuple[PreparedScene, MotionBasisReport]:
-        """The scene of fast images and its error. The first call takes seconds; may be called from several threads."""
+    def fast(self) -> FastScene:
+        """The scene of fast images. The first call takes seconds; may be called from several threads."""
         with self._guard:
             if self._fast is None:
-                self._fast = fast_scene(self.scene, self.model.views.get("train", ()))
+                self._fast = FastScene.of(self.scene, self.model.views.get("train", ()))
             return self._fast
 
 
@@ -185,7 +185,7 @@ def _rendered(loaded: LoadedModel, request: RenderRequest, queued: float) -> Enc
         last = now
 
     note("queue")
-    scene = loaded.fast()[0] if request.fast else loaded.scene
+    scene = loaded.fast().seen_by(request.camera) if request.fast else loaded.scene
     view = (request.camera, request.time, request.background)
     data = picture(scene, *view, loaded.model.units, request.content, request.format, note=note)
     return EncodedImage(data, seconds)

@@ -17,7 +17,7 @@ from graings.export.picture import Content, check_content, picture
 from graings.export.shown import UP, open_shown
 from graings.image_encoding import image_format
 from graings.kernel import use_threads
-from graings.render import PreparedScene, fast_scene, render
+from graings.render import FastScene, PreparedScene, render
 
 RenderPath = Annotated[
     Path,
@@ -103,7 +103,8 @@ def render_view(
         if not isinstance(scene, PreparedScene):
             raise typer.BadParameter("splats do not move: there is no motion to approximate", param_hint="--fast")
         exact = render(scene, view, time, rgb).color
-        scene, approximation = fast_scene(scene, shown.views.get("train", ()))
+        fast_scene = FastScene.of(scene, shown.views.get("train", ()))
+        scene, approximation = fast_scene.seen_by(view), fast_scene.line(view)
     started = perf_counter()
     image = picture(scene, view, time, rgb, shown.units, show, format)
     milliseconds = 1e3 * (perf_counter() - started)
@@ -111,7 +112,7 @@ def render_view(
     print_line(f"{output}: {view.width} x {view.height} at t = {time:g}, rendered in {milliseconds:.0f} ms.")
     if approximation is not None:
         similarity = psnr(render(scene, view, time, rgb).color, exact)
-        print_line(f"Fast: {approximation.line}.")
+        print_line(f"Fast: {approximation}.")
         print_line(f"This image has a PSNR of {similarity:.1f} dB against the exact one.")
 
 

@@ -61,6 +61,7 @@ class MotionBasis:
     opacities: Float[Tensor, " child"]  # with `opacity_view` from the middle of the training views
     color_offsets: Float[Tensor, "child 3"]
     opacity_offsets: Float[Tensor, " child"]  # the residual's part of `opacities`
+    pixel_rates: Float[Tensor, " child"]  # px per unit of length in the training view that shows it largest
     geometry: TimeBasis
     residual: TimeBasis
     report: MotionBasisReport
@@ -135,6 +136,7 @@ class MotionBasis:
             opacities=opacities.float(),
             color_offsets=residual.state[:, :3].float().contiguous(),
             opacity_offsets=residual.state[:, 3].float().contiguous(),
+            pixel_rates=geometry.child_scales.float(),
             geometry=moving,
             residual=changing,
             report=MotionBasisReport(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from graings import constants
-from graings.camera.camera import View
+from graings.camera.camera import Camera, View
 from graings.scene.children import LOG_SCALE_RANGE, Geometry, quaternion_product
 from graings.scene.prepared import PreparedScene
 from graings.scene.time_basis import TimeSignal, pieces
@@ -102,15 +102,14 @@ class _State:
         shown = [(view, means[min(round(view.time / spacing), len(times) - 1)].double().numpy()) for view in views]
         largest = np.zeros(len(rows))
         for view, positions in shown:
-            largest = np.maximum(largest, _rates(view, positions))
+            largest = np.maximum(largest, pixels_per_unit(view.camera, positions))
         # Children that no view shows are judged as if they lay in the middle of the scene.
         largest[largest == 0] = prepared.scene.sampling.reference
         self.rates = torch.from_numpy(largest).to(self.means.dtype)
 
 
-def _rates(view: View, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels per unit of length at each position that the view shows, else 0."""
-    camera = view.camera
+def pixels_per_unit(camera: Camera, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """f |x - c| / Z^2, the norm of the Jacobian of the projection, at each of the positions [n, 3] in view; else 0."""
     points, depth = camera.project(positions)
     inside = (points >= 0).all(1) & (points[:, 0] <= camera.width) & (points[:, 1] <= camera.height)
     distance = np.linalg.norm(positions - camera.center, axis=1)

@@ -67,7 +67,7 @@ class _Still(PreparedGeometry):
 
     @property
     def products(self) -> float:
-        return 0
+        return 0.0
 
 
 class _Evaluated(PreparedGeometry):
@@ -113,7 +113,7 @@ class _Factorized(PreparedGeometry):
 
     @property
     def products(self) -> float:
-        return self._hidden.values.numel()
+        return float(self._hidden.values.numel())
 
 
 class BasisGeometry(PreparedGeometry):
@@ -140,7 +140,7 @@ class BasisGeometry(PreparedGeometry):
 
     @property
     def products(self) -> float:
-        return self._weights.values.numel()
+        return float(self._weights.values.numel())
 
 
 def unmoved(canonical: Float[Tensor, "child 7"], children: Children) -> Float[Tensor, "child 10"]:

@@ -109,7 +109,8 @@ class RenderQuery(BaseModel):
     format: ImageFormat | None = Field(None, description="Instead of the Accept header.")
     fast: bool = Field(
         False,
-        description="Approximate the motion; X-Graings-Fast says by how much. The first such image takes seconds.",
+        description="Approximate the motion, unless the view is too near for that; X-Graings-Fast says by how much. "
+        "The first such image takes seconds.",
     )
 
 
@@ -151,7 +152,7 @@ async def render(
     resolved = perf_counter()
     image = await context.pool.render(loaded, request, headers["ETag"])
     if request.fast:
-        headers["X-Graings-Fast"] = (await to_thread.run_sync(loaded.fast))[1].line
+        headers["X-Graings-Fast"] = (await to_thread.run_sync(loaded.fast)).line(camera)
     headers["Server-Timing"] = _server_timing({"request": resolved - started, **image.seconds})
     return Response(image.data, media_type=MEDIA_TYPES[format], headers=headers)
 

@@ -15,7 +15,7 @@ from graings.export.export import SequenceFrame, SequenceManifest
 from graings.footage.report import FootageCamera, FootageReport
 from graings.inspection.inspect import inspect_capture
 from graings.player.scene_file import read_scene, scene_bytes
-from graings.render import PreparedScene, fast_scene
+from graings.render import FastScene, PreparedScene
 from graings.report import events, start_events
 from graings.report.events import Event, Grew, StepSkipped
 from graings.report.folder import report_runs
@@ -104,7 +104,7 @@ def documents(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         "event": EVENTS[0].to_json(),
         "footage": FOOTAGE.to_json(),
         "inspection": inspect_capture(capture)[0].to_json(),
-        "motion_basis": fast_scene(PreparedScene(model.scene), model.views["train"])[1].to_json(),
+        "motion_basis": FastScene.of(PreparedScene(model.scene), model.views["train"]).report.to_json(),
         "ply_sequence": sequence.to_json(),
         "player_scene": read_scene(scene_bytes(model))[1].to_json(),
     }

@@ -18,7 +18,7 @@ from graings.camera.camera import Camera
 from graings.camera.view_request import MAX_SIDE
 from graings.camera.viewpoint import orbit_view
 from graings.image_encoding import encode_image
-from graings.render import PreparedScene, fast_scene, render
+from graings.render import FastScene, PreparedScene, render
 from graings.storage.checkpoint import load_model
 from jobs.store import JobFolder
 from service.rendering import LoadedModel, ModelCache, RenderPool, RenderRequest
@@ -50,10 +50,10 @@ def test_a_fast_image_is_that_of_the_approximated_scene(client: TestClient, mode
     view = {"t": 0.37, "camera": "val:1"}
     exact, fast = (client.get("/render", params={**view, "fast": fast}) for fast in (False, True))
     loaded = load_model(trained)
-    scene, report = fast_scene(PreparedScene(loaded.scene), loaded.views["train"])
-    expected = render(scene, loaded.views["val"][1].camera, 0.37, loaded.background)
+    approximated = FastScene.of(PreparedScene(loaded.scene), loaded.views["train"])
+    expected = render(approximated.approximate, loaded.views["val"][1].camera, 0.37, loaded.background)
     assert fast.content == encode_image(expected.color.numpy(), "png")
-    assert fast.headers["x-graings-fast"] == report.line
+    assert fast.headers["x-graings-fast"] == approximated.report.line
     assert "x-graings-fast" not in exact.headers
     assert exact.content == client.get("/render", params=view).content
     assert exact.headers["etag"] != fast.headers["etag"]
