@@ -24,8 +24,8 @@ PIXELS: Final = 0.2
 LEVELS: Final = 1.0
 MOST_PIXELS: Final = 0.5
 
-# Moving children whose magnification is compared for each view: 512 take a twentieth of a millisecond.
-SAMPLES: Final = 512
+# Moving children whose magnification is compared for each view: 256 take less than a tenth of a millisecond.
+SAMPLES: Final = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,9 @@ class FastScene:
         seen = rates > 0
         if not seen.any():
             return 0.0 if len(self._rates) == self.report.geometry.children else float("inf")
-        return self.report.geometry.error.p99 * float(np.quantile(rates[seen] / self._rates[seen], 0.99))
+        magnified = rates[seen] / self._rates[seen]
+        rank = round(0.99 * (len(magnified) - 1))  # np.quantile takes twenty times as long
+        return self.report.geometry.error.p99 * float(np.partition(magnified, rank)[rank])
 
     def seen_by(self, camera: Camera) -> PreparedScene:
         """The scene to draw for `camera`: exact where the approximation would err by more than MOST_PIXELS."""
