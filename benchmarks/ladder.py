@@ -59,7 +59,7 @@ ROWS = (
     Row("color", "view harmonics and mirrored direction", ("scene.color_sh_degree", "scene.reflection")),
     Row("residual", "residual colour sees the view", ("scene.residual_sh_degree",)),
     Row("blur", "low-pass filter 0.1", ("scene.blur",)),
-    Row("rates", "learning rates, projected clips", ("rates", "scene.projected_clip")),
+    Row("clips", "projected clips", ("scene.projected_clip",)),
     Row("muon", "Muon for weight matrices", ("matrix_optimizer",)),
     Row(
         "budget",

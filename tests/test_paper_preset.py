@@ -86,14 +86,14 @@ READINGS: Final[dict[str, Any]] = {
     "density.prune_opacity": 0.005,
     "density.prune_until": 29_000,
     "rates.anchors": (6e-4, 6e-6),
-    "rates.offsets": (0.044, 4.4e-4),
-    "rates.features": (0.0075, 0.0075),
-    "rates.log_scales": (0.007, 0.007),
-    "rates.static": (0.004, 0.004),
-    "rates.color": (0.008, 5e-5),
-    "rates.opacity": (0.002, 2e-5),
+    "rates.offsets": (0.02, 1e-3),
+    "rates.features": (0.0075, 0.003),
+    "rates.log_scales": (0.007, 0.003),
+    "rates.static": (0.004, 4e-4),
+    "rates.color": (0.008, 2e-4),
+    "rates.opacity": (7e-4, 7e-6),
     "rates.residual": (0.002, 2e-5),
-    "rates.deformation": (8e-4, 1.6e-6),
+    "rates.deformation": (0.002, 5e-5),
 }
 
 

@@ -93,16 +93,6 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
             "prune_from": 24_600,  # 80 % of the joint phase
             "unseen_pixels": 0.0,
         },
-        # Those of Scaffold-GS where it has the parameter, that of DeformNet from Deformable-3DGS.
-        "rates": {
-            "offsets": (0.044, 4.4e-4),
-            "features": (0.0075, 0.0075),
-            "log_scales": (0.007, 0.007),
-            "static": (0.004, 0.004),
-            "color": (0.008, 5e-5),
-            "opacity": (0.002, 2e-5),
-            "deformation": (8e-4, 1.6e-6),
-        },
         "guard": {"skip_only": True},
     },
 }
