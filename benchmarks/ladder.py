@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from graings.config import TrainConfig, make_config
-from graings.report.metrics_document import METRICS_FILE, Metrics, read_metrics
-from graings.storage.run_folder import RECORD_FILE
+from graings.report.metrics_document import Metrics, read_metrics
+from graings.storage.run_folder import METRICS_FILE, RECORD_FILE
 from graings.training.run import TrainingRun
 
 FINE = make_config("fine")

@@ -15,11 +15,11 @@ from pathlib import Path
 from time import time
 from typing import Any, Final
 
-from graings.storage.run_folder import MODEL_FILE, PLAN_FILE
+from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, MODEL_FILE, PLAN_FILE
 from jobs.engine import Engine, QueueEntry
 from jobs.job import Attempt, Job, JobConflict, JobDamaged, JobNotFound, JobSpec, JobState
 from jobs.progress import last_progress
-from jobs.store import CURVE_FILE, METRICS_FILE, Store
+from jobs.store import Store
 from jobs.webhooks import message
 
 LOG = logging.getLogger(__name__)

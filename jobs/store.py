@@ -24,7 +24,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from graings.storage.files import sync_folder, sync_tree, write_json
-from graings.storage.run_folder import MODEL_FILE, PLAN_FILE, newest_checkpoint
+from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, MODEL_FILE, PLAN_FILE, newest_checkpoint
 from jobs.job import (
     Attempt,
     CaptureNotFound,
@@ -40,8 +40,6 @@ from jobs.job import (
 from jobs.locks import locked
 
 KEPT_ATTEMPTS = 50
-METRICS_FILE = "metrics.json"
-CURVE_FILE = "curve.svg"
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +119,7 @@ class JobFolder:
         """Names of the files and folders of the run; none before the training has begun."""
         try:
             return frozenset(os.listdir(self.run))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return frozenset()
 
     def checkpoint(self) -> int | None:

@@ -20,10 +20,10 @@ from graings.config import TrainConfig, make_config
 from graings.document import read_document
 from graings.errors import CaptureError, CheckpointError, ConfigError
 from graings.report.figure_files import png, svg
-from graings.report.metrics_document import METRICS_FILE, Metrics, read_metrics
+from graings.report.metrics_document import Metrics, read_metrics
 from graings.report.run_record import RunRecord
 from graings.storage.files import write_bytes, write_document, write_text
-from graings.storage.run_folder import RECORD_FILE
+from graings.storage.run_folder import METRICS_FILE, RECORD_FILE
 from graings.training.run import TrainingRun
 
 # Options that do not change what is computed, or that an ablation sets for each run.

@@ -12,8 +12,9 @@ from urllib.parse import quote
 from graings.api.scenes import export_model, open_scene, render_video, render_view, save_image
 from graings.capture.synthetic import SUITE
 from graings.errors import CheckpointError
-from graings.report.metrics_document import METRICS_FILE, Metrics, read_metrics
+from graings.report.metrics_document import Metrics, read_metrics
 from graings.report.run_record import read_record
+from graings.storage.run_folder import METRICS_FILE
 
 SIDE: Final = 320  # px of stills and clips
 SECONDS: Final = 4.0

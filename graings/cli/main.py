@@ -35,8 +35,9 @@ from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedE
 from graings.kernel import use_threads
 from graings.report.evaluate_run import evaluate_run
 from graings.report.folder import report_runs
-from graings.report.metrics_document import METRICS_FILE, read_metrics
+from graings.report.metrics_document import read_metrics
 from graings.report.work_precision import summary
+from graings.storage.run_folder import METRICS_FILE
 
 UNAVAILABLE: Final = 69  # after sysexits.h, as the others
 EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (

@@ -14,11 +14,12 @@ from graings.evaluation.evaluate import evaluate
 from graings.evaluation.metrics import SplitMetrics
 from graings.evaluation.motion import MotionMetrics, measure_motion
 from graings.evaluation.perceptual import PerceptualDistances
-from graings.report.metrics_document import METRICS_FILE, read_metrics
+from graings.report.metrics_document import read_metrics
 from graings.report.run_record import read_record
 from graings.storage.compact import open_model
 from graings.storage.files import write_document
 from graings.storage.model import Model
+from graings.storage.run_folder import METRICS_FILE
 
 
 def evaluate_run(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -18,8 +18,6 @@ from graings.plan.plan import Plan
 from graings.report.events import Event
 from graings.report.machine import MachineFacts, VersionFacts
 from graings.report.start_events import Channel
-
-METRICS_FILE: Final = "metrics.json"
 
 Seconds = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]

@@ -16,7 +16,7 @@ from graings.config.schedule import TRAINING_PHASES
 from graings.errors import CheckpointError
 from graings.evaluation.metrics import SplitMetrics
 from graings.report.formatting import duration
-from graings.report.metrics_document import METRICS_FILE, EvaluationPoint, Metrics, read_metrics
+from graings.report.metrics_document import EvaluationPoint, Metrics, read_metrics
 from graings.report.work_precision_document import (
     ErrorFloor,
     FinalMetrics,
@@ -27,6 +27,7 @@ from graings.report.work_precision_document import (
     TrainedRun,
     TrainingPart,
 )
+from graings.storage.run_folder import METRICS_FILE
 
 TARGETS_DB: Final = (20.0, 25.0, 30.0, 35.0, 40.0)
 

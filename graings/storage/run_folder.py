@@ -14,6 +14,8 @@ from graings.errors import CheckpointError
 
 RECORD_FILE = "run.json"
 PLAN_FILE = "plan.json"
+METRICS_FILE = "metrics.json"
+CURVE_FILE = "curve.svg"
 LOCK_FILE = ".training"
 CHECKPOINTS = "checkpoints"
 MODEL_FILE = "model.graings"  # the compact model

@@ -21,7 +21,7 @@ from graings.plan.capture_statistics import measure
 from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan, make_plan
 from graings.report.events import Diverged, Event
-from graings.report.metrics_document import METRICS_FILE, EvaluationPoint, read_metrics
+from graings.report.metrics_document import EvaluationPoint, read_metrics
 from graings.report.run_record import read_plan, read_record
 from graings.storage.checkpoint import (
     best_checkpoint,
@@ -31,7 +31,7 @@ from graings.storage.checkpoint import (
     load_training,
     newest_checkpoint,
 )
-from graings.storage.run_folder import RECORD_FILE, check_unused, sole_trainer
+from graings.storage.run_folder import METRICS_FILE, RECORD_FILE, check_unused, sole_trainer
 from graings.training.curriculum.missing_motion import MissingMotion, check_iteration
 from graings.training.curriculum.restart import RestartState
 from graings.training.density.unseen import drop_unseen

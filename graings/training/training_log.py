@@ -22,7 +22,6 @@ from graings.report.figure_files import svg
 from graings.report.folder import report_training
 from graings.report.machine import machine_facts, version_facts
 from graings.report.metrics_document import (
-    METRICS_FILE,
     CaptureFacts,
     CompactFacts,
     EvaluationPoint,
@@ -37,7 +36,7 @@ from graings.report.work_precision import run_names
 from graings.scene.scene import Scene
 from graings.storage.files import write_document, write_text
 from graings.storage.model import scene_bytes
-from graings.storage.run_folder import RECORD_FILE
+from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, RECORD_FILE
 from graings.training.guard.guard import Guard
 from graings.training.guard.stiffness import Stiffness
 from graings.training.timing import Clock
@@ -191,7 +190,7 @@ class TrainingLog:
     def _write_plots(self, metrics: Metrics) -> None:
         started = time.perf_counter()
         curve = curve_figure([point.model_dump(mode="json") for point in metrics.curve])
-        write_text(self.folder / "curve.svg", svg(curve))
+        write_text(self.folder / CURVE_FILE, svg(curve))
         report_training(run_names([self.folder])[0], metrics, self.config, self.folder / "report")
         self._plotting_s += time.perf_counter() - started
 

@@ -9,8 +9,9 @@ import pytest
 from graings.capture.load import load_capture
 from graings.image_encoding import encode_image
 from graings.render import render
-from graings.report.metrics_document import METRICS_FILE, read_metrics
+from graings.report.metrics_document import read_metrics
 from graings.storage.checkpoint import load_model
+from graings.storage.run_folder import METRICS_FILE
 from tests.cli.test_cli import TINY, graings
 
 

@@ -118,6 +118,18 @@ def test_a_damaged_job_names_its_file_and_can_be_deleted(tmp_path: Path, content
     assert [path.name for path in (tmp_path / "captures").iterdir()] == [DIGEST]
 
 
+def test_a_run_that_is_missing_or_no_folder_has_no_files(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    folder = store.folder(store.create(spec(), unpacked(store, "u", "a.json")))
+    assert folder.run_files() == frozenset()
+    folder.run.touch()
+    assert folder.run_files() == frozenset()
+    folder.run.unlink()
+    folder.run.mkdir()
+    folder.metrics.touch()
+    assert folder.run_files() == {"metrics.json"}
+
+
 def test_damaged_attempts_name_their_file(tmp_path: Path) -> None:
     store = Store(tmp_path)
     folder = store.folder(store.create(spec(), unpacked(store, "u", "a.json")))
