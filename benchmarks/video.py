@@ -20,7 +20,8 @@ from graings import kernel
 from graings.camera.view_request import ViewRequest
 from graings.export.camera_path import frames_of
 from graings.export.shown import open_shown
-from graings.export.video import CODECS, video_file, write_video
+from graings.export.video import FORMATS, write_video
+from graings.export.video_file import video_file
 from graings.render import render
 
 
@@ -55,13 +56,15 @@ def main() -> None:
 
             of_render = cpu_ms(rendered, len(frames))
             gaussians = len(shown.scene.compose(camera.center, 0.5).gaussians)
-            for suffix in (*CODECS, ""):
+            for suffix in (*FORMATS, ""):
                 path = Path(folder) / f"video{suffix}"
 
                 def encoded() -> None:
-                    with video_file(path, camera.width & ~1, camera.height & ~1, 30.0) as add:  # noqa: B023
-                        for frame in levels:  # noqa: B023
-                            add(frame)
+                    files = [path] if path.suffix else [Path(folder) / f"{k}.png" for k in range(len(levels))]  # noqa: B023
+                    for file in files:
+                        with video_file(file, camera.width & ~1, camera.height & ~1, 30.0) as add:  # noqa: B023
+                            for frame in levels if path.suffix else levels[int(file.stem)][None]:  # noqa: B023
+                                add(frame)
 
                 of_encoding = cpu_ms(encoded, len(frames))
                 whole = cpu_ms(lambda: write_video(path, shown, frames, background), len(frames))  # noqa: B023

@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from graings.storage.files import sync_folder, sync_tree, write_json
+from graings.storage.files import sync, sync_tree, write_json
 from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, MODEL_FILE, PLAN_FILE, newest_checkpoint
 from jobs.job import (
     Attempt,
@@ -207,7 +207,7 @@ class Store:
                 if capture.exists():
                     capture.rename(self.uploads / f"{job_id}.replaced")
                 unpacked.rename(capture)
-                sync_folder(self._captures)
+                sync(self._captures)
                 shutil.rmtree(self.uploads / f"{job_id}.replaced", ignore_errors=True)
             # The folder is renamed after its record is written: a folder in jobs/ always has its record.
             part = self.uploads / f"{job_id}.job"
@@ -217,7 +217,7 @@ class Store:
             stored = {"spec": {**values, "webhook_secret": secret}, "submitted": values}
             write_json(part / "job.json", {"id": job_id, "created_at": now, **stored})
             part.rename(self._jobs / job_id)
-            sync_folder(self._jobs)
+            sync(self._jobs)
             if key is not None:
                 submission.unlink(missing_ok=True)  # that of a deleted job
                 submission.symlink_to(self._jobs / job_id)

@@ -2,7 +2,8 @@
 
     <job>/tasks/<id>/    task.json, progress.json, and the video
 
-A task waits in the queue beside the jobs, and survives the death of its worker: it then begins again.
+A task waits in the queue beside the jobs, and survives the death of its worker: a video then goes on where it was, an
+evaluation begins again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The child process that does one task of a job: `python -m jobs.task_process JOB_FOLDER TASK --threads N`.
 
 It ends with an `ExitCode`; if that is an error, standard output is one JSON object with the message. SIGTERM, SIGINT or
-the end of its parent end it at once; the task then begins again when it is taken again.
+the end of its parent end it at once. When the task is taken again, a video goes on where it was if the model is the
+same, and an evaluation begins again.
 """
 
 from __future__ import annotations

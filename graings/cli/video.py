@@ -15,6 +15,7 @@ from graings.cli.training import Threads
 from graings.export.camera_path import Moves, frames_of
 from graings.export.shown import UP, open_shown
 from graings.export.video import check_video, write_video
+from graings.export.video_parts import FRAMES
 from graings.kernel import use_threads
 
 
@@ -77,7 +78,11 @@ def video(
     started = perf_counter()
     with task_progress() as bar:
         task = bar.add_task("rendering", total=len(frames))
-        write_video(output, shown, frames, rgb, fps=fps, observe=lambda done: bar.update(task, completed=done))
+        try:
+            write_video(output, shown, frames, rgb, fps=fps, observe=lambda done: bar.update(task, completed=done))
+        except KeyboardInterrupt:
+            print_line(f"Interrupted. The same command goes on where it was, to {FRAMES} frames.")
+            raise
     elapsed = perf_counter() - started
     size = f"{frames[0][0].width} x {frames[0][0].height}"
     print_line(f"{output}: {len(frames)} frames, {size}, {len(frames) / elapsed:.1f} frames per second to make.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,12 +27,13 @@ _DISTANCE = 1.3  # times that at which a sphere with nine tenths of the splats f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shown:
-    """A scene in normalised units, and what `ViewRequest.resolve` needs."""
+    """A scene in normalised units, and what `ViewRequest.resolve` needs. `digest` is the sha256 of its file."""
 
     scene: PreparedScene | Splats
     units: Units
     views: Mapping[str, tuple[View, ...]]
     background: Color
+    digest: str
 
 
 def open_shown(path: Path, up: Sequence[float] = UP) -> Shown:
@@ -41,7 +43,7 @@ def open_shown(path: Path, up: Sequence[float] = UP) -> Shown:
     """
     if not path.is_file() or suffix_of(path, READABLE) is None:
         model = open_model(path)
-        return Shown(PreparedScene(model.scene), model.units, model.views, model.background)
+        return Shown(PreparedScene(model.scene), model.units, model.views, model.background, model.digest)
     length = math.hypot(*up)
     if not (math.isfinite(length) and length > 0):
         raise ValueError(f"up must be three finite numbers, not all 0, got {tuple(up)}")
@@ -56,4 +58,5 @@ def open_shown(path: Path, up: Sequence[float] = UP) -> Shown:
         width=_SIZE,
         height=_SIZE,
     )
-    return Shown(splats, units, {"train": (View(path.name, camera, 0.0),)}, (1.0, 1.0, 1.0))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return Shown(splats, units, {"train": (View(path.name, camera, 0.0),)}, (1.0, 1.0, 1.0), digest)

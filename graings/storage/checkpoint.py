@@ -27,7 +27,7 @@ from graings.camera.units import Units
 from graings.config import TrainConfig
 from graings.errors import CheckpointError
 from graings.scene.scene import Scene
-from graings.storage.files import sync_folder, sync_tree
+from graings.storage.files import sync, sync_tree
 from graings.storage.model import DAMAGE, Model, model_facts, model_from
 from graings.storage.run_folder import BEST, CHECKPOINTS, FACTS_FILE, checkpoints
 from graings.storage.run_folder import best_checkpoint as best_checkpoint  # part of this module's interface too
@@ -105,7 +105,7 @@ def save_checkpoint(
             final.rename(old)
         part.rename(final)
         shutil.rmtree(old, ignore_errors=True)
-        sync_folder(folder)
+        sync(folder)
     except (OSError, SafetensorError) as error:  # the library has its own for a full disk
         shutil.rmtree(part, ignore_errors=True)
         raise CheckpointError(

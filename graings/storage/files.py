@@ -24,7 +24,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     except BaseException:
         os.unlink(name)
         raise
-    sync_folder(path.parent)
+    sync(path.parent)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -42,22 +42,18 @@ def write_document(path: Path, document: Document) -> None:
     write_json(path, document.to_json())
 
 
-def sync_folder(path: Path) -> None:
-    """Write the entries of a folder to the disk: until then a power failure may undo a rename in it."""
-    _sync(path)
+def sync(path: Path) -> None:
+    """Write a file, or the entries of a folder, to the disk: until then a power failure may undo a rename in it."""
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def sync_tree(path: Path) -> None:
     """Write the folder, the folders in it and the contents of all their files to the disk."""
     for folder, _, files in os.walk(path):
         for name in files:
-            _sync(Path(folder, name))
-        _sync(Path(folder))
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+            sync(Path(folder, name))
+        sync(Path(folder))

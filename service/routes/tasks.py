@@ -69,7 +69,7 @@ def make_video(job_id: JobId, spec: VideoSpec, context: ContextDep, response: Re
     if spec.frames > MAX_FRAMES:
         raise BadRequest(f"seconds x fps is {spec.frames} frames; at most {MAX_FRAMES} are made.")
     model = loaded.model
-    shown = Shown(loaded.scene, model.units, model.views, model.background)
+    shown = Shown(loaded.scene, model.units, model.views, model.background, model.digest)
     try:  # now, while the client waits: nothing but the rendering is left to the worker
         frames_of(shown, spec.request, spec.path, spec.moves, spec.frames)
     except (ValueError, CheckpointError) as error:

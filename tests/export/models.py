@@ -9,6 +9,8 @@ from typing import Any
 from graings.camera.camera import Camera, View
 from graings.camera.units import Units
 from graings.config import make_config
+from graings.export.shown import Shown
+from graings.render import PreparedScene
 from graings.storage.model import Model
 from tests.models import tiny_scene
 
@@ -46,3 +48,9 @@ def tiny_model(**config: Any) -> Model:
         digest="0",
         path=Path("tiny"),
     )
+
+
+def tiny_shown(digest: str = "0") -> Shown:
+    """The tiny model, prepared."""
+    model = tiny_model()
+    return Shown(PreparedScene(model.scene), model.units, model.views, model.background, digest)

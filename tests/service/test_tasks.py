@@ -7,9 +7,12 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from graings.export.video_file import decoded, video_file
+from graings.export.video_parts import FRAMES
 from jobs.queue import JobQueue
 from jobs.store import JobFolder
 from jobs.task_list import MAX_TASKS
@@ -87,15 +90,25 @@ def test_an_evaluation_and_a_video_are_made_by_a_worker(client: TestClient, jobs
 
 
 @pytest.mark.slow(reason="two workers start, and a video of a few seconds is rendered")
-def test_a_video_survives_its_worker_and_a_deleted_one_stops(client: TestClient, jobs: JobQueue, finished: str) -> None:
-    video = ask(client, f"/jobs/{finished}/videos", json={"width": 400, "seconds": 4, "fps": 60, "format": "gif"})
+def test_a_video_goes_on_after_the_death_of_its_worker_and_a_deleted_one_stops(
+    client: TestClient, jobs: JobQueue, finished: str
+) -> None:
+    wanted = {"width": 400, "height": 300, "seconds": 6, "fps": 60}
+    video = ask(client, f"/jobs/{finished}/videos", json=wanted)
     with working(jobs) as worker:
-        until(lambda: (get(client, video)["progress"] or {}).get("done"))
+        until(lambda: (get(client, video)["progress"] or {}).get("done", 0) > FRAMES)
         worker.send_signal(signal.SIGKILL)
         worker.wait()
+    (part,) = (jobs.store.folder(finished).tasks / video["id"] / ".video.mp4.parts").glob("0*")
+    with video_file(part, 400, 300, 60.0) as add:  # whether this part is used again shows in its colour
+        for _ in range(FRAMES):
+            add(np.full((300, 400, 3), (250, 0, 0), np.uint8))
     with working(jobs) as worker:
         assert ended(client, video)["state"] == "succeeded"
-        assert client.get(f"{video['links']['self']}/video").content[:6] == b"GIF89a"
+        path = jobs.store.root / "downloaded_whole.mp4"
+        path.write_bytes(client.get(f"{video['links']['self']}/video").content)
+        red = [bool(np.abs(frame.mean((0, 1)) - (250, 0, 0)).max() < 8) for frame in decoded(path)]
+        assert red == [True] * FRAMES + [False] * (360 - FRAMES)
         endless = ask(client, f"/jobs/{finished}/videos", json=LONG)
         until(lambda: get(client, endless)["progress"])
         assert len(children(worker.pid, "jobs.task_process")) == 1
