@@ -79,10 +79,13 @@ def video(
     with task_progress() as bar:
         task = bar.add_task("rendering", total=len(frames))
         try:
-            write_video(output, shown, frames, rgb, fps=fps, observe=lambda done: bar.update(task, completed=done))
+            rendered = write_video(
+                output, shown, frames, rgb, fps=fps, observe=lambda done: bar.update(task, completed=done)
+            )
         except KeyboardInterrupt:
             print_line(f"Interrupted. The same command goes on where it was, to {FRAMES} frames.")
             raise
     elapsed = perf_counter() - started
     size = f"{frames[0][0].width} x {frames[0][0].height}"
-    print_line(f"{output}: {len(frames)} frames, {size}, {len(frames) / elapsed:.1f} frames per second to make.")
+    kept = "" if rendered == len(frames) else f" ({len(frames) - rendered} of them were there)"
+    print_line(f"{output}: {len(frames)} frames{kept}, {size}, {rendered / elapsed:.1f} frames per second to make.")

@@ -36,13 +36,14 @@ def write_video(
     *,
     fps: float = 30.0,
     observe: Callable[[int], None] = lambda done: None,
-) -> None:
+) -> int:
     """Render `frames`, each a camera and a time in [0, 1], on `background` into the file or folder `path`.
 
     `observe` is called with the number of frames that are done. An existing file is replaced when the video is whole.
-    A call that was interrupted goes on where it was when it is repeated (`graings.export.video_parts`). Codecs with
-    subsampled colour need even sides: an odd one loses a pixel. Raises `ValueError` for a rate out of range,
-    `CheckpointError` where PyAV is missing, an encoder fails, or another process makes this video.
+    A call that was interrupted goes on where it was when it is repeated (`graings.export.video_parts`); returned is how
+    many frames were rendered by this call. Codecs with subsampled colour need even sides: an odd one loses a pixel.
+    Raises `ValueError` for a rate out of range, `CheckpointError` where PyAV is missing, an encoder fails, or another
+    process makes this video.
     """
     check_video(path)
     if not 0 < fps <= 240:
@@ -54,6 +55,7 @@ def write_video(
         raise ValueError(f"{path.suffix} needs at least 2 x 2 pixels")
     frames = [(camera.resized(width, height), time) for camera, time in frames]
     identity = _identity(frames, (encoder_version(path), shown.digest, *background, fps))
+    rendered = 0
     with open_parts(path, identity) as parts:
         for first in range(0, len(frames), parts.frames):
             chosen = frames[first : first + parts.frames]
@@ -65,7 +67,9 @@ def write_video(
                     color = render(shown.scene, camera, time, background).color.numpy()
                     add(np.rint(np.clip(color, 0.0, 1.0) * 255.0).astype(np.uint8))
                     observe(done)
+            rendered += len(chosen)
         parts.finish(len(frames), width, height, fps)
+    return rendered
 
 
 def _identity(frames: Sequence[tuple[Camera, float]], others: Sequence[object]) -> str:

@@ -35,7 +35,8 @@ _TAGS: Final = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": 
 CODECS: Final = {
     ".mp4": Codec("libx264", "yuv420p", {"crf": "16", "preset": "medium", **_TAGS}, {"movflags": "+faststart"}),
     ".webm": Codec("libvpx-vp9", "yuv420p", {"crf": "22", "b:v": "0", "row-mt": "1", "cpu-used": "4", **_TAGS}, {}),
-    ".webp": Codec("libwebp_anim", "bgra", {"quality": "85"}, {"loop": "0"}),
+    # Not libwebp_anim, which leaves faint traces of earlier frames where the background is seen again.
+    ".webp": Codec("libwebp", "bgra", {"quality": "85"}, {"loop": "0"}),
     ".gif": Codec("gif", "pal8", {}, {"loop": "0"}),
     ".mkv": Codec("libx264rgb", "rgb24", {"qp": "0", "preset": "ultrafast"}, {}),  # lossless
 }
