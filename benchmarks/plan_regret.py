@@ -31,7 +31,16 @@ from graings.report.run_record import read_plan
 from graings.training.calibration import calibration
 from graings.training.run import TrainingRun
 
-T_95 = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571}  # two-sided, by degrees of freedom
+T_95 = {
+    1: 12.706,
+    2: 4.303,
+    3: 3.182,
+    4: 2.776,
+    5: 2.571,
+    7: 2.365,
+    9: 2.262,
+    11: 2.201,
+}  # two-sided, by degrees of freedom
 NOISE = 0.01
 HEAD = (
     "| part | scene | decision | PSNR with | without | difference, 95 % | CPU s with | without | kB with | without | "

@@ -1,7 +1,7 @@
 """JobQueue: submit, inspect, cancel, resume, retry and delete jobs.
 
 Combines the entry of a job in the queue (`jobs.engine`) with its files on disk (`jobs.store`), and checks which
-operations its state allows. It has no state of its own: any number of processes may have one.
+operations its state allows. It has no state of its own but what it has read: any number of processes may have one.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from typing import Any, Final
 from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, MODEL_FILE, PLAN_FILE
 from jobs.engine import Engine, QueueEntry
 from jobs.job import Attempt, Job, JobConflict, JobDamaged, JobNotFound, JobSpec, JobState
+from jobs.known_jobs import KnownJobs, stamp_of
 from jobs.progress import last_progress
-from jobs.store import Store
+from jobs.store import JobFolder, Store
 from jobs.webhooks import message
 
 LOG = logging.getLogger(__name__)
@@ -36,6 +37,7 @@ class JobQueue:
     def __init__(self, store: Store, engine: Engine) -> None:
         self.store = store
         self._engine = engine
+        self._known = KnownJobs()
 
     def enqueue_stored_jobs(self) -> None:
         """Enqueue stored jobs that have no entry, because the process died in between. Call once at the start."""
@@ -179,28 +181,37 @@ class JobQueue:
 
     def _job(self, job_id: str, entry: QueueEntry | None) -> Job:
         folder = self.store.folder(job_id)
-        state = JobState.QUEUED if entry is None else entry.state
-        error = None if entry is None else entry.error
-        spec, attempts = UNREADABLE_SPEC, list[Attempt]()
         try:
-            spec, attempts = folder.spec(), folder.attempts()
+            spec = folder.spec()
+            stamp = stamp_of(folder, spec, entry)
+            known = self._known.get(job_id, stamp)
+            if known is None:
+                known = _read(folder, spec, folder.attempts(), entry)
+                # A cancelled job that is queued again may still have the trainer of before.
+                starts_anew = known.state is JobState.QUEUED and known.attempts > 0
+                self._known.keep(known, None if starts_anew else stamp)
+            return known
         except JobDamaged as damage:
             # A damaged file must neither hide the other jobs nor prevent the deletion of this one.
-            state, error = JobState.FAILED if entry is None else state, str(damage)
-        files = folder.run_files()
-        return Job(
-            id=job_id,
-            spec=spec,
-            state=state,
-            created_at=folder.created_at(),
-            started_at=attempts[0].started_at if attempts else None,
-            finished_at=None if entry is None else entry.finished_at,
-            attempts=attempts[-1].number if attempts else 0,
-            progress=last_progress(folder.progress),
-            checkpoint=folder.checkpoint() if files else None,
-            has_metrics=METRICS_FILE in files,
-            has_curve=CURVE_FILE in files,
-            has_plan=PLAN_FILE in files,
-            has_model=MODEL_FILE in files,
-            error=error,
-        )
+            job = _read(folder, UNREADABLE_SPEC, [], entry)
+            return replace(job, state=JobState.FAILED if entry is None else job.state, error=str(damage))
+
+
+def _read(folder: JobFolder, spec: JobSpec, attempts: list[Attempt], entry: QueueEntry | None) -> Job:
+    files = folder.run_files()
+    return Job(
+        id=folder.path.name,
+        spec=spec,
+        state=JobState.QUEUED if entry is None else entry.state,
+        created_at=folder.created_at(),
+        started_at=attempts[0].started_at if attempts else None,
+        finished_at=None if entry is None else entry.finished_at,
+        attempts=attempts[-1].number if attempts else 0,
+        progress=last_progress(folder.progress),
+        checkpoint=folder.checkpoint() if files else None,
+        has_metrics=METRICS_FILE in files,
+        has_curve=CURVE_FILE in files,
+        has_plan=PLAN_FILE in files,
+        has_model=MODEL_FILE in files,
+        error=None if entry is None else entry.error,
+    )

@@ -199,7 +199,8 @@ class TrainingRun:
                 point, more = self._finish()
                 events += more
             yield RunReport(
-                **({part.name: getattr(step, part.name) for part in fields(step)} | {"events": step.events + events}),
+                **{part.name: getattr(step, part.name) for part in fields(step)}
+                | {"events": step.events + events, "anchors": self._trainer.scene.scaffold.count},
                 iterations_per_s=rate.per_second(),
                 train_s=self.log.clock.train_s(),
                 evaluation=point,
@@ -260,8 +261,7 @@ class TrainingRun:
         trainer = self._trainer
         events = drop_unseen(trainer, self.log)
         point, splits = self.output.evaluate_end(trainer, self.iteration)
-        stiffness = self.output.stiffness(trainer)
-        events += stiffness.events(self.iteration)
+        events += (stiffness := self.output.stiffness(trainer)).events(self.iteration)
         self.log.note(events)
         self._save(finished=True)
         compact = self.output.export(trainer)

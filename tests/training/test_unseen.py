@@ -58,7 +58,9 @@ def test_anchors_that_no_training_view_shows_are_removed_and_the_views_stay_as_t
 
 def test_a_run_ends_without_them_and_says_so(micro: Path, tmp_path: Path) -> None:
     kept = trained(micro, tmp_path / "kept", **{"density.unseen_pixels": 0.0})
-    run = trained(micro, tmp_path / "run", **{"density.unseen_pixels": 0.5})
+    run = TrainingRun.create(micro, tmp_path / "run", micro_config(iterations=20, **{"density.unseen_pixels": 0.5}))
+    reports = list(run)
+    assert reports[-1].anchors == run.trainer.scene.scaffold.count
     removed = kept.trainer.scene.scaffold.count - run.trainer.scene.scaffold.count
     assert removed > 0
     metrics = read_metrics(run.metrics_path)
