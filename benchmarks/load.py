@@ -2,7 +2,7 @@
 
     python benchmarks/load.py RUN [--clients 1 2 8 50 200] [--seconds 20] [--side 400] [--training CAPTURE]
 
-Starts `graings serve` on a temporary data folder with 50 jobs, the newest of which has the trained model of RUN. Load
+Starts `graings serve` on a temporary data folder with 50 jobs that have ended with the trained model of RUN. Load
 comes from `wrk` (a Debian package) with kept connections; each request has its own time and azimuth. Meanwhile one
 client each asks for an image, `GET /jobs` and `GET /healthz` again and again, with pauses of 50 ms, and records the
 latency of what is served: wrk's own mixes served and refused requests. `--training` also runs a worker with a job on
@@ -33,6 +33,7 @@ import numpy as np
 JOBS = 50
 PAUSE_S = 0.05
 START_S = 60.0
+SETTLED_S = 61.0  # after which the service takes the files of a job that has ended for final
 
 LUA = """
 local counter = 0
@@ -96,19 +97,24 @@ class Probe(threading.Thread):
 
 
 def data_folder(folder: Path, run: Path, python: str) -> None:
-    """50 jobs, the newest with the model, made by the service's own store. Runs in the given interpreter."""
+    """50 jobs that have ended with the files of `run`, made by the service's own queue in the given interpreter."""
     code = (
-        "import pathlib, shutil, sys, time\n"
-        "from graings.config import make_config\nfrom jobs.job import JobSpec\nfrom jobs.store import Store\n"
+        "import os, pathlib, shutil, sys, time\n"
+        "from graings.config import make_config\nfrom jobs.commands import default_database\n"
+        "from jobs.engine import Engine\nfrom jobs.job import JobSpec\nfrom jobs.queue import JobQueue\n"
+        "from jobs.store import Store\n"
         "root, run, count = sys.argv[1:]\nstore = Store(pathlib.Path(root))\n"
+        "engine = Engine(default_database(store.root))\nqueue = JobQueue(store, engine)\n"
         "config = make_config('draft').model_dump(mode='json')\n"
         "for n in range(int(count)):\n"
         "    unpacked = store.uploads / 'u'\n    unpacked.mkdir()\n    (unpacked / 'a').touch()\n"
-        "    job = store.create(JobSpec(name=f'job {n}', capture='0' * 64, config=config), unpacked)\n"
-        "    time.sleep(0.002)\n"
-        "shutil.copytree(run, store.folder(job).run)\n"
+        "    job = queue.submit(JobSpec(name=f'job {n}', capture='0' * 64, config=config), unpacked).id\n"
+        "    job_folder = store.folder(job)\n    job_folder.end_attempt(job_folder.begin_attempt('worker'), 0)\n"
+        "    shutil.copytree(run, job_folder.run)\n    engine.cancel(job)\n"
+        "engine.close()\n"
     )
     subprocess.run([python, "-c", code, folder, run, str(JOBS)], check=True)
+    time.sleep(SETTLED_S)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from service.problems import problem
 
 # A refusal is sent only about when the client may try again: many do so at once, and hundreds of them would take
 # the CPU time of the images. The times are spread, so that they do not all come back together. Waiting costs no thread.
-RETRY_AFTER_S = 1
+RETRY_AFTER_S = 2
 
 
 class Admission:
