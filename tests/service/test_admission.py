@@ -7,7 +7,7 @@ import httpx2
 import pytest
 from starlette.types import Message, Receive, Scope, Send
 
-from service.admission import Admission
+from service.admission import RETRY_AFTER_S, Admission
 
 
 class Slow:
@@ -51,7 +51,7 @@ def test_a_request_beyond_the_limit_is_refused_and_others_are_not_affected() -> 
             assert app.started == 2
             assert (await client.get("/jobs")).status_code == 200
             refused = await client.get("/render")
-            assert refused.headers["retry-after"] == "1"
+            assert refused.headers["retry-after"] == str(RETRY_AFTER_S)
             assert refused.json()["type"] == "urn:graings:problem:busy"
             app.finish.set()
         assert statuses == [503] * 3 + [200] * 2
