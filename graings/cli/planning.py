@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -123,8 +123,14 @@ def _reasons(decision: Decision) -> list[str]:
         reasons.append(f"{verb} about {saving.predicted_s / 60:.1f} min CPU ({saving.predicted_share:.0%})")
     if decision.override is not None and decision.decision in ("drop", "propose", "later"):
         verb = "to do so" if decision.decision == "propose" else "to keep it"
-        reasons.append(f"{verb}: --set '{decision.override}'")
+        reasons.append(f"{verb}: {_arguments(decision.override)}")
     return reasons
+
+
+def _arguments(options: Mapping[str, Any]) -> str:
+    """Options, by dotted name, as arguments of `graings train`."""
+    parts = [("--preset", str(v)) if k == "preset" else ("--set", f"{k}={json.dumps(v)}") for k, v in options.items()]
+    return shlex.join(part for pair in parts for part in pair)
 
 
 def _costs(config: TrainConfig, planned: Plan) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
 
 from graings.document import Document
 
@@ -100,4 +100,6 @@ class Decision(Document):
     iteration: int | None = Field(
         None, ge=0, description="Iteration at which training decided, or may decide first; null before training."
     )
-    override: str | None = Field(None, description="Option that decides otherwise; null where there is none.")
+    override: dict[str, JsonValue] | None = Field(
+        None, description="Options, by dotted name, that decide otherwise; null where there are none."
+    )

@@ -147,7 +147,7 @@ def _residual(statistics: CaptureStatistics, config: TrainConfig) -> Decision:
         condition=condition,
         bound=bound,
         iteration=first,
-        override='plan.keep=["residual"]',
+        override={"plan.keep": ["residual"]},
     )
 
 
@@ -164,7 +164,7 @@ def _view_dependence(statistics: CaptureStatistics, config: TrainConfig) -> Deci
         condition=Condition(
             name="loss of PSNR with the colours of another view", op="<=", value=None, threshold=0.05, unit="dB"
         ),
-        override="scene.residual_sh_degree=0, scene.reflection=false, scene.color_sh_degree=1",
+        override={"scene.residual_sh_degree": 0, "scene.reflection": False, "scene.color_sh_degree": 1},
     )
 
 
@@ -238,7 +238,7 @@ def _growth(config: TrainConfig) -> Decision:
         reason=f"after {QUIET_GROWTHS} growths without a new anchor {then}",
         condition=condition,
         iteration=config.scaled(config.density.grow_from) if aggressive else None,
-        override='plan.keep=["growth"]' if aggressive else "plan.mode=aggressive",
+        override={"plan.keep": ["growth"]} if aggressive else {"plan.mode": "aggressive"},
     )
 
 
@@ -263,14 +263,14 @@ def _preset(statistics: CaptureStatistics, config: TrainConfig) -> Decision:
         kind="estimated",
         reason=f"{reason}: {proposed}" + ("" if same else f" instead of {config.preset}"),
         condition=condition,
-        override=f"preset={proposed}",
+        override={"preset": proposed},
     )
 
 
 def _dropped(component: Component, kind: Kind, reason: str, condition: Condition | None) -> Decision:
     keepable: Sequence[str] = ("deformation", "residual", "alpha_loss")
     bound = Bound(value=0.0, how="the same computation" if kind == "exact" else "the other parts reach the same images")
-    override = f'plan.keep=["{component}"]' if component in keepable else None
+    override = {"plan.keep": [component]} if component in keepable else None
     return Decision(
         component=component,
         decision="drop",
@@ -291,5 +291,5 @@ def _estimated(config: TrainConfig, part: Part, reason: str, condition: Conditio
         kind="estimated",
         reason=reason,
         condition=condition,
-        override=f'plan.keep=["{part}"]' if aggressive else "plan.mode=aggressive",
+        override={"plan.keep": [part]} if aggressive else {"plan.mode": "aggressive"},
     )

@@ -48,6 +48,23 @@ def test_the_table_names_every_part_and_the_minutes(capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.usefixtures("calibrated")
+def test_what_a_row_says_can_be_done_by_its_arguments(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    capture = write_fixed(tmp_path / "c", lambda c, t: texture(16), cameras=6, times=2, size=16)
+
+    def row(part: str, *arguments: str) -> str:
+        return next(line for line in planned(capsys, str(capture), *arguments).splitlines() if line.startswith(part))
+
+    proposed = row("preset", "--preset", "draft")
+    assert "proposed" in proposed
+    assert "keep" in row("preset", *shlex.split(proposed.rpartition("to do so: ")[2]))
+    proposed = row("deformation")
+    assert "proposed" in proposed
+    dropped = row("deformation", *shlex.split(proposed.rpartition("to do so: ")[2]))
+    assert "leave out" in dropped
+    assert "keep" in row("deformation", *shlex.split(dropped.rpartition("to keep it: ")[2]))
+
+
+@pytest.mark.usefixtures("calibrated")
 def test_the_printed_command_trains_what_was_planned(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     capture = write_fixed(tmp_path / "a capture", lambda c, t: texture(16), cameras=6, times=1, size=16)
     settings = ("--set", 'plan.keep=["residual"]', "--set", "preset=draft", "--aggressive")

@@ -41,7 +41,7 @@ MONOCULAR = {"camera_motion": "moving", "change": None, "gain": None, "offset": 
 
 
 def plan_of(facts: dict[str, Any] | None = None, **options: object) -> Plan:
-    return make_plan(FACTS.model_copy(update=facts or {}), make_config("draft", options))
+    return make_plan(FACTS.model_copy(update=facts or {}), make_config(overrides={"preset": "draft", **options}))
 
 
 def verdict(plan: Plan, component: Any) -> tuple[str, str]:
@@ -179,6 +179,17 @@ def test_every_dropped_part_says_how_to_keep_it_or_is_exact() -> None:
             assert decision.decision != "drop" or free or decision.override
 
 
+@pytest.mark.parametrize("options", [{}, AGGRESSIVE])
+def test_the_options_that_decide_otherwise_do_so(options: dict[str, Any]) -> None:
+    for facts in ({"times": 1}, {}, MONOCULAR, {"alpha": "absent", "points": 9}):
+        for decision in plan_of(facts, **options).decisions:
+            if decision.override is None or decision.decision == "keep":
+                continue
+            other = plan_of(facts, **{**options, **decision.override}).decision(decision.component)
+            assert other is not None
+            assert other.decision in ({"propose": ("drop", "keep")}.get(decision.decision, ("keep",))), decision
+
+
 def test_a_plan_survives_its_file() -> None:
     plan = plan_of({"times": 1})
     assert Plan.model_validate(plan.to_json()) == plan
@@ -195,9 +206,9 @@ def test_a_condition_compares(op: Any, value: float, holds: bool) -> None:
 
 def test_a_longer_training_is_proposed_for_much_detail_and_never_a_draft_for_what_moves(tmp_path: Path) -> None:
     rich, poor = {"detail": 0.5, "pixels": 160_000}, {"detail": 0.001}
-    assert [d.override for d in plan_of(rich).decisions if d.component == "preset"] == ["preset=fine"]
+    assert [d.override for d in plan_of(rich).decisions if d.component == "preset"] == [{"preset": "fine"}]
     assert verdict(plan_of({**poor, "times": 1}), "preset")[0] == "keep"
-    assert [d.override for d in plan_of(poor).decisions if d.component == "preset"] == ["preset=standard"]
+    assert [d.override for d in plan_of(poor).decisions if d.component == "preset"] == [{"preset": "standard"}]
     assert verdict(
         make_plan(statistics_of(write_synthetic(tmp_path / "c", frames=6, size=24)), make_config()), "preset"
     )
