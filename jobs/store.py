@@ -24,6 +24,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from graings.storage.files import sync, sync_tree, write_json
+from graings.storage.locks import locked
 from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, MODEL_FILE, PLAN_FILE, newest_checkpoint
 from jobs.job import (
     Attempt,
@@ -37,7 +38,6 @@ from jobs.job import (
     is_id,
     new_id,
 )
-from jobs.locks import locked
 
 KEPT_ATTEMPTS = 50
 

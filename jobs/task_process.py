@@ -24,8 +24,8 @@ from graings.export.shown import open_shown
 from graings.export.video import write_video
 from graings.kernel import use_threads
 from graings.report.evaluate_run import evaluate_run
+from graings.storage.locks import locked
 from jobs.exit_code import ExitCode
-from jobs.locks import locked
 from jobs.parent import watch_parent
 from jobs.store import JobFolder, Store
 from jobs.task import EvaluationSpec, TaskFolder, VideoSpec

@@ -27,13 +27,13 @@ from graings.report.events import Diverged
 from graings.report.folder import report_runs
 from graings.report.run_record import read_record
 from graings.storage.files import write_document
+from graings.storage.locks import locked
 from graings.storage.run_folder import RECORD_FILE
 from graings.training.calibration import calibration
 from graings.training.run import TrainingRun
 from graings.training.run_output import RunReport
 from jobs.capture_phase import Stopped, capture_of
 from jobs.exit_code import ExitCode
-from jobs.locks import locked
 from jobs.parent import watch_parent
 from jobs.progress import ProgressReport, ProgressWriter, last_progress
 from jobs.store import JobFolder, Store

@@ -29,7 +29,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.camera": (),
     "graings.kernel": (),
     "graings.capture": ("graings.camera", "graings.config"),
-    "graings.footage": ("graings.storage.files",),
+    "graings.footage": ("graings.storage.files", "graings.storage.locks"),
     "graings.scene": ("graings.camera", "graings.config", "graings.kernel"),
     "graings.raster": ("graings.camera", "graings.kernel"),
     "graings.render": ("graings.camera", "graings.raster", "graings.scene"),  # they meet here and nowhere else
@@ -81,11 +81,13 @@ LAYERS: dict[str, tuple[str, ...]] = {
     # Durable work knows the method by its options and files; one child process trains.
     "jobs": (
         *("graings.config", "graings.document", "graings.report.events", "graings.storage.files"),
-        "graings.storage.run_folder",
+        *("graings.storage.locks", "graings.storage.run_folder"),
     ),
     "jobs.capture_phase": ("graings.capture.synthetic", "graings.footage", "jobs"),
     "jobs.task": ("graings.camera.view_request", "graings.export.camera_path", "graings.storage.files", "jobs"),
-    "jobs.task_process": ("graings.export", "graings.kernel", "graings.report.evaluate_run", "jobs"),
+    "jobs.task_process": (
+        *("graings.export", "graings.kernel", "graings.report.evaluate_run", "graings.storage.locks", "jobs"),
+    ),
     "jobs.trainer_process": ("graings.config", "graings.report", "graings.storage", "graings.training", "jobs"),
     # What a program elsewhere uses: it knows nothing but HTTP.
     "client": (),

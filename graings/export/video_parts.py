@@ -8,7 +8,6 @@ no such parts, are lossless.
 
 from __future__ import annotations
 
-import fcntl
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from typing import Final
 from graings.errors import CheckpointError
 from graings.export.video_file import decoded, join, video_file
 from graings.storage.files import write_text
+from graings.storage.locks import locked
 
 FRAMES: Final = 120  # of a part
 LOCK_FILE: Final = ".lock"
@@ -69,11 +69,9 @@ def open_parts(path: Path, identity: str) -> Iterator[VideoParts]:
         raise CheckpointError(f"{path}: exists already. Choose another name, or remove it.")
     folder = path.with_name(f".{path.name}.parts")
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK_FILE).open("a") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise CheckpointError(f"{path}: is being made by another process. Wait for it, or stop it.") from error
+    with locked(folder / LOCK_FILE, wait=False) as free:
+        if not free:
+            raise CheckpointError(f"{path}: is being made by another process. Wait for it, or stop it.")
         known = folder / IDENTITY_FILE
         if not known.exists() or known.read_text() != identity:
             for file in folder.iterdir():

@@ -7,7 +7,6 @@ frames begins again.
 
 from __future__ import annotations
 
-import fcntl
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -29,6 +28,7 @@ from graings.footage.sharpness import blurred
 from graings.footage.source import find_footage
 from graings.footage.video import extract_frames
 from graings.storage.files import write_document, write_json
+from graings.storage.locks import locked
 
 if TYPE_CHECKING:
     import pycolmap
@@ -171,12 +171,10 @@ def _request(source: Path, count: int, max_side: int) -> FrameRequest:
 @contextmanager
 def _sole(workspace: Path) -> Iterator[None]:
     """Lock a workspace for one call. Raises `CaptureError` when another process of this machine has the lock."""
-    with (workspace / LOCK_FILE).open("a") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+    with locked(workspace / LOCK_FILE, wait=False) as free:
+        if not free:
             remedy = "Wait for it, or choose another folder."
-            raise CaptureError("is being written by another process", file=workspace.parent, remedy=remedy) from error
+            raise CaptureError("is being written by another process", file=workspace.parent, remedy=remedy)
         yield
 
 

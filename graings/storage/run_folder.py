@@ -5,12 +5,12 @@ Separate from `graings.storage.checkpoint`, so that a look at the progress of a 
 
 from __future__ import annotations
 
-import fcntl
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from graings.errors import CheckpointError
+from graings.storage.locks import locked
 
 RECORD_FILE = "run.json"
 PLAN_FILE = "plan.json"
@@ -58,9 +58,7 @@ def check_unused(run: Path) -> None:
 @contextmanager
 def sole_trainer(run: Path) -> Iterator[None]:
     """Lock a run folder for one trainer. Raises `CheckpointError` when another process of this machine has the lock."""
-    with (run / LOCK_FILE).open("a") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise CheckpointError(f"{run}: is being trained by another process. Wait for it, or stop it.") from error
+    with locked(run / LOCK_FILE, wait=False) as free:
+        if not free:
+            raise CheckpointError(f"{run}: is being trained by another process. Wait for it, or stop it.")
         yield

@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
 from graings.storage.files import write_json
 from graings.storage.run_folder import CHECKPOINTS, FACTS_FILE, METRICS_FILE
 from jobs import known_jobs
-from jobs.commands import default_database
-from jobs.engine import Engine, QueueEntry
+from jobs.engine import QueueEntry
 from jobs.job import Job, JobSpec, JobState
 from jobs.known_jobs import KnownJobs, stamp_of
 from jobs.queue import JobQueue
-from jobs.store import JobFolder, Store
-
-
-@pytest.fixture
-def jobs(tmp_path: Path) -> Iterator[JobQueue]:
-    store = Store(tmp_path / "data")
-    engine = Engine(default_database(store.root))
-    yield JobQueue(store, engine)
-    engine.close()
+from jobs.store import JobFolder
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from graings.storage.locks import locked
 from jobs.exit_code import ExitCode
 from jobs.job import JobConflict, JobDamaged, JobNotFound, JobSpec
 from jobs.leftovers import LEFTOVER_S, discard_leftovers
-from jobs.locks import locked
 from jobs.store import Store
 
 DIGEST = "ab" * 32

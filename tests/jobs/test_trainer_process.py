@@ -14,9 +14,9 @@ import pytest
 from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
 from graings.storage.checkpoint import load_model
+from graings.storage.locks import locked
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
-from jobs.locks import locked
 from jobs.progress import last_progress, read_progress
 from jobs.store import KEPT_ATTEMPTS, JobFolder, Store
 from jobs.trainer_process import _report

@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,7 +21,6 @@ from jobs.engine import MESSAGES, Engine
 from jobs.job import JobSpec
 from jobs.lease import FileLeases
 from jobs.queue import JobQueue
-from jobs.store import Store
 from jobs.webhooks import PRIVATE, WebhookError, deliver
 from jobs.worker import Worker, requeue_work_of_dead_workers
 
@@ -69,14 +67,6 @@ def receiver() -> Iterator[Receiver]:
     receiver = Receiver()
     yield receiver
     receiver.close()
-
-
-@pytest.fixture
-def jobs(tmp_path: Path) -> Iterator[JobQueue]:
-    store = Store(tmp_path / "data")
-    engine = Engine(default_database(store.root))
-    yield JobQueue(store, engine)
-    engine.close()
 
 
 def submit(jobs: JobQueue, webhook: str) -> str:

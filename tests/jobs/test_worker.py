@@ -16,28 +16,18 @@ import pytest
 
 from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
+from graings.storage.locks import locked
 from jobs.child_process import _lower_priority
-from jobs.commands import TRAINING_NICE, default_database
-from jobs.engine import Engine
+from jobs.commands import TRAINING_NICE
 from jobs.exit_code import ExitCode
 from jobs.job import Attempt, JobConflict, JobSpec, JobState
-from jobs.locks import locked
 from jobs.queue import JobQueue
-from jobs.store import Store
 from jobs.worker import MAX_CRASHES, MAX_WORKER_DEATHS, give_up_reason
 
 LONG_S = 120.0
 # Long enough to be interrupted, with a checkpoint every 20 iterations.
 ENDLESS = {"iterations": 100_000, "init.points": 300, "evaluation.checkpoint_every": 20, "evaluation.first": 99_000}
 BRIEF = {"iterations": 30, "init.points": 300, "evaluation.views": 1}
-
-
-@pytest.fixture
-def jobs(tmp_path: Path) -> Iterator[JobQueue]:
-    store = Store(tmp_path / "data")
-    engine = Engine(default_database(store.root))
-    yield JobQueue(store, engine)
-    engine.close()
 
 
 def submit(jobs: JobQueue, options: dict[str, object], name: str = "job") -> str:
