@@ -63,9 +63,11 @@ def open_parts(path: Path, identity: str) -> Iterator[VideoParts]:
     """The parts of the video `path` that are whole, if `identity`, which stands for all that decides how it looks, is
     that with which they were made.
 
-    Raises `CheckpointError` while another process makes this video, and where a folder of pictures is not empty.
+    Raises `CheckpointError` while another process makes this video, and where `path` is a folder in place
+    of a file, a file in place of a folder, or a folder that is not empty.
     """
-    if not path.suffix and path.exists() and (not path.is_dir() or any(path.iterdir())):
+    other_kind = path.exists() and path.is_dir() == bool(path.suffix)
+    if other_kind or (path.is_dir() and any(path.iterdir())):
         raise CheckpointError(f"{path}: exists already. Choose another name, or remove it.")
     folder = path.with_name(f".{path.name}.parts")
     folder.mkdir(parents=True, exist_ok=True)

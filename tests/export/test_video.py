@@ -214,6 +214,20 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
     assert len(pictures(tmp_path / "empty")) == 3
 
 
+@pytest.mark.parametrize("suffix", KINDS)
+def test_a_folder_in_place_of_a_file_and_the_reverse_are_refused_before_any_work(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a{suffix}"
+    if suffix:
+        path.mkdir()
+    else:
+        path.write_bytes(b"mine")
+    seen: list[int] = []
+    with pytest.raises(CheckpointError, match="exists already"):
+        write_video(path, tiny_shown(), path_of(3), WHITE, observe=seen.append)
+    assert seen == []
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
 def test_wrong_requests_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\.mp4, \.webm"):
         check_video(Path("a.avi"))
