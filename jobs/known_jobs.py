@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import OrderedDict
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from jobs.engine import QueueEntry
-from jobs.job import Job, JobSpec, JobState
-from jobs.store import JobFolder
+from jobs.job import Job, JobNotFound, JobSpec, JobState
+from jobs.store import RUN, JobFolder
 
 LIMIT: Final = 2_000  # jobs
 SETTLED_S: Final = 60.0  # after the end of a job; the trainer of a cancelled one still writes its checkpoint
@@ -51,16 +51,23 @@ class KnownJobs:
 
 
 def stamp_of(folder: JobFolder, spec: JobSpec, entry: QueueEntry | None) -> Stamp | None:
-    """The stamp of a job; None where a process may be writing into its files, whose folders then keep their times."""
+    """The stamp of a job; None where a process may be writing into its files, whose folders then keep their times.
+
+    Raises `JobNotFound` if the job was deleted.
+    """
     if entry is None or entry.state is JobState.RUNNING:
         return None
     if entry.state.final and time.time() - (entry.finished_at or time.time()) < SETTLED_S:
         return None
-    return Stamp(entry, spec, folder.path.stat().st_mtime_ns, _modified(folder.run))
+    path = str(folder.path)
+    modified_ns = _modified_ns(path)
+    if modified_ns is None:
+        raise JobNotFound(folder.path.name)
+    return Stamp(entry, spec, modified_ns, _modified_ns(f"{path}/{RUN}"))
 
 
-def _modified(path: Path) -> int | None:
+def _modified_ns(path: str) -> int | None:
     try:
-        return path.stat().st_mtime_ns
+        return os.stat(path).st_mtime_ns
     except FileNotFoundError:
         return None

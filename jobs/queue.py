@@ -85,11 +85,12 @@ class JobQueue:
         """
         ids = iter([job_id for job_id in self.store.ids() if after is None or job_id < after])
         jobs: list[Job] = []
-        while batch := list(islice((job_id for job_id in ids if wanted(job_id, self.spec(job_id))), limit + 1)):
-            entries = self._engine.entries(batch)
-            for job_id in batch:
+        found = ((job_id, spec) for job_id in ids if wanted(job_id, spec := self.spec(job_id)))
+        while batch := list(islice(found, limit + 1)):
+            entries = self._engine.entries([job_id for job_id, _ in batch])
+            for job_id, spec in batch:
                 with suppress(JobNotFound):  # deleted meanwhile
-                    job = self._job(job_id, entries.get(job_id))
+                    job = self._job(job_id, entries.get(job_id), None if spec is UNREADABLE_SPEC else spec)
                     if not states or job.state in states:
                         jobs.append(job)
             if len(jobs) > limit:
@@ -99,7 +100,7 @@ class JobQueue:
     def spec(self, job_id: str) -> JobSpec:
         """The specification, or `UNREADABLE_SPEC` for a job that is damaged or was deleted."""
         try:
-            return self.store.folder(job_id).spec()
+            return self.store.listed_folder(job_id).spec()
         except (JobDamaged, JobNotFound):
             return UNREADABLE_SPEC
 
@@ -179,14 +180,15 @@ class JobQueue:
         """How many jobs wait for a worker. Raises `JobError` if the database does not answer."""
         return self._engine.waiting()
 
-    def _job(self, job_id: str, entry: QueueEntry | None) -> Job:
-        folder = self.store.folder(job_id)
+    def _job(self, job_id: str, entry: QueueEntry | None, spec: JobSpec | None = None) -> Job:
+        """The job; `spec` is its specification where that was just read."""
+        folder = self.store.listed_folder(job_id)
         try:
-            spec = folder.spec()
+            spec = spec or folder.spec()
             stamp = stamp_of(folder, spec, entry)
             known = self._known.get(job_id, stamp)
             if known is None:
-                known = _read(folder, spec, folder.attempts(), entry)
+                known = _read(self.store.folder(job_id), spec, folder.attempts(), entry)
                 # A cancelled job that is queued again may still have the trainer of before.
                 starts_anew = known.state is JobState.QUEUED and known.attempts > 0
                 self._known.keep(known, None if starts_anew else stamp)

@@ -40,6 +40,7 @@ from jobs.job import (
 )
 
 KEPT_ATTEMPTS = 50
+RUN = "run"  # the folder of the run in that of its job
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class JobFolder:
 
     @property
     def run(self) -> Path:
-        return self.path / "run"
+        return self.path / RUN
 
     @property
     def capture(self) -> Path:
@@ -96,9 +97,9 @@ class JobFolder:
 
     def spec(self) -> JobSpec:
         """The specification. Raises `JobDamaged`, and `JobNotFound` if the job was deleted meanwhile."""
-        file = self.path / "job.json"
+        file = f"{self.path}/job.json"  # read for each job of a list: a Path would take longer than the disk
         try:
-            return _read_spec(str(file), file.stat().st_mtime_ns)
+            return _read_spec(file, os.stat(file).st_mtime_ns)
         except (OSError, ValueError, KeyError, TypeError) as error:
             if not self.path.is_dir():
                 raise JobNotFound(self.path.name) from error
@@ -225,10 +226,14 @@ class Store:
 
     def folder(self, job_id: str) -> JobFolder:
         """The files of a job. Raises `JobNotFound`."""
-        path = self._jobs / check_id(job_id)
-        if not path.is_dir():
+        folder = self.listed_folder(job_id)
+        if not folder.path.is_dir():
             raise JobNotFound(job_id)
-        return JobFolder(path)
+        return folder
+
+    def listed_folder(self, job_id: str) -> JobFolder:
+        """The files of a job that was there a moment ago; that it still is, is not checked."""
+        return JobFolder(self._jobs / check_id(job_id))
 
     def ids(self) -> list[str]:
         """All jobs, newest first, since ids begin with the time. Other files in their folder are ignored."""

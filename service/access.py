@@ -3,14 +3,18 @@
 A caller shows a key in `Authorization: Bearer`, or a browser the session it was given for one. Reading needs the scope
 `read` and everything else `train`, except for the operations in `NEEDS`. A job belongs to the key that made it: to
 others it does not exist. Without any key, a service that only this machine can reach lets everybody do everything.
+
+Dependencies are coroutines here and elsewhere: FastAPI gives every other function a thread, and a request that changes
+threads ten times waits ten times for two busy cores.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Annotated, Final
 
+from anyio import to_thread
 from fastapi import Depends, Request, Security
 from fastapi.routing import APIRoute
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
@@ -75,19 +79,11 @@ def identify(request: Request, context: Context, secret: str | None) -> Caller:
     return Caller()
 
 
-def authorize(request: Request, context: ContextDep, header: BearerDep, session: SessionDep) -> Iterator[None]:
+async def authorize(
+    request: Request, context: ContextDep, header: BearerDep, session: SessionDep
+) -> AsyncIterator[None]:
     """Let the request pass if its caller may send it; the caller is then `request.state.caller`."""
-    caller = identify(request, context, header.credentials if header else session)
-    needed = _needed(request)
-    if not caller.scope.includes(needed):
-        raise Forbidden(f"This needs a key of scope {needed}, and this one has {caller.scope}.", needed)
-    by_session = header is None and caller.key is not None
-    # Browsers name the origin of every request that changes something, and SameOrigin compares it with the host.
-    if by_session and request.method not in SAFE_METHODS and "origin" not in request.headers:
-        raise Forbidden("A session is for pages of this service. Programs send Authorization: Bearer.", needed)
-    job_id = request.path_params.get("job_id") or request.query_params.get("job")
-    if job_id is not None and not caller.sees(job_id, context.jobs.spec(job_id)):
-        raise JobNotFound(job_id)
+    caller = await to_thread.run_sync(_permitted, request, context, header, session)
     request.state.caller = caller
     if caller.key is None:
         yield
@@ -101,13 +97,31 @@ def authorize(request: Request, context: ContextDep, header: BearerDep, session:
         context.request_limits.end(name)
 
 
+def _permitted(
+    request: Request, context: Context, header: HTTPAuthorizationCredentials | None, session: str | None
+) -> Caller:
+    """The caller, if it may send the request. Reads files."""
+    caller = identify(request, context, header.credentials if header else session)
+    needed = _needed(request)
+    if not caller.scope.includes(needed):
+        raise Forbidden(f"This needs a key of scope {needed}, and this one has {caller.scope}.", needed)
+    by_session = header is None and caller.key is not None
+    # Browsers name the origin of every request that changes something, and SameOrigin compares it with the host.
+    if by_session and request.method not in SAFE_METHODS and "origin" not in request.headers:
+        raise Forbidden("A session is for pages of this service. Programs send Authorization: Bearer.", needed)
+    job_id = request.path_params.get("job_id") or request.query_params.get("job")
+    if job_id is not None and not caller.sees(job_id, context.jobs.spec(job_id)):
+        raise JobNotFound(job_id)
+    return caller
+
+
 def _needed(request: Request) -> Scope:
     route = request.scope.get("route")
     name = route.operation_id if isinstance(route, APIRoute) else None
     return NEEDS.get(name or "", Scope.READ if request.method in SAFE_METHODS else Scope.TRAIN)
 
 
-def _caller_of(request: Request) -> Caller:
+async def _caller_of(request: Request) -> Caller:
     caller: Caller = request.state.caller
     return caller
 

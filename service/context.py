@@ -85,7 +85,7 @@ def open_context(settings: Settings) -> Context:
     )
 
 
-def _context_of(request: Request) -> Context:
+async def _context_of(request: Request) -> Context:
     context: Context = request.app.state.context
     return context
 

@@ -99,9 +99,9 @@ def log(job_id: JobId, here: ContextDep, tail: Annotated[int, Query(ge=1, le=100
     return PlainTextResponse(b"".join(lines[-tail:]).decode("utf-8", "replace"))
 
 
-def _known(job_id: JobId, here: ContextDep) -> Job:
+async def _known(job_id: JobId, here: ContextDep) -> Job:
     """The job, looked up before the stream begins: afterwards the status can no longer be 404."""
-    return here.jobs.get(job_id)
+    return await to_thread.run_sync(here.jobs.get, job_id)
 
 
 @router.get("/events", operation_id="get_events", response_class=EventSourceResponse, responses={200: EVENT_STREAM})

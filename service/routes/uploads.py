@@ -44,13 +44,13 @@ class UploadResource(BaseModel):
         )
 
 
-def owned(
+async def owned(
     context: ContextDep,
     caller: CallerDep,
     upload_id: Annotated[str, Path(pattern="^[0-9a-f]{32}$", description="Id of an upload.")],
 ) -> ResumableUpload:
     """The upload, if it is one of the caller's. Raises `UploadNotFound`."""
-    return owned_upload(context, caller, upload_id)
+    return await to_thread.run_sync(owned_upload, context, caller, upload_id)
 
 
 OwnedDep = Annotated[ResumableUpload, Depends(owned)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 
 import pytest
@@ -99,6 +100,40 @@ def test_a_deleted_job_is_not_listed_and_a_repaired_one_is_read(jobs: JobQueue) 
     assert [(job.id, job.error is None) for job in listed(jobs)] == [(kept, False)]
     file.write_text(content)
     assert [(job.id, job.error) for job in listed(jobs)] == [(kept, None)]
+
+
+@pytest.mark.parametrize("settled_s", [60.0, -60.0])
+def test_a_job_that_is_deleted_while_the_list_is_made_is_not_in_it(
+    jobs: JobQueue, monkeypatch: pytest.MonkeyPatch, settled_s: float
+) -> None:
+    monkeypatch.setattr(known_jobs, "SETTLED_S", settled_s)
+    kept, gone = ended(jobs), ended(jobs)
+    assert [job.id for job in listed(jobs)] == [gone, kept]
+
+    def wanted(job_id: str, spec: JobSpec) -> bool:
+        """All jobs; deletes the files of one after its specification was read."""
+        if job_id == gone:
+            shutil.rmtree(jobs.store.folder(job_id).path)
+        return True
+
+    assert [job.id for job in jobs.page(10, wanted=wanted)[0]] == [kept]
+
+
+def test_the_specification_of_a_job_is_looked_at_once_for_a_list(
+    jobs: JobQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in "abc":
+        submit(jobs, name)
+    read = JobFolder.spec
+    looked_at: list[str] = []
+
+    def counting(folder: JobFolder) -> JobSpec:
+        looked_at.append(folder.path.name)
+        return read(folder)
+
+    monkeypatch.setattr(JobFolder, "spec", counting)
+    assert [job.spec.name for job in listed(jobs)] == ["c", "b", "a"]
+    assert len(looked_at) == len(set(looked_at)) == 3
 
 
 def test_what_a_trainer_may_still_write_is_read_every_time(jobs: JobQueue, monkeypatch: pytest.MonkeyPatch) -> None:
