@@ -81,16 +81,19 @@ class JobQueue:
     ) -> tuple[list[Job], str | None]:
         """Jobs older than `after`, newest first, at most `limit`; and the id for the next page, if there may be more.
 
-        Only jobs whose id and specification are `wanted`, in one of `states` unless that is empty.
+        Only jobs whose id and specification are `wanted`, in one of `states` unless that is empty. The states are those
+        of now; what the files of a job that has ended say may be a second old.
         """
         ids = iter([job_id for job_id in self.store.ids() if after is None or job_id < after])
         jobs: list[Job] = []
-        found = ((job_id, spec) for job_id in ids if wanted(job_id, spec := self.spec(job_id)))
+        found = ((job_id, spec) for job_id in ids if wanted(job_id, spec := self._listed_spec(job_id)))
         while batch := list(islice(found, limit + 1)):
             entries = self._engine.entries([job_id for job_id, _ in batch])
             for job_id, spec in batch:
+                entry = entries.get(job_id)
                 with suppress(JobNotFound):  # deleted meanwhile
-                    job = self._job(job_id, entries.get(job_id), None if spec is UNREADABLE_SPEC else spec)
+                    read = None if spec is UNREADABLE_SPEC else spec
+                    job = self._known.recent(job_id, entry) or self._job(job_id, entry, read)
                     if not states or job.state in states:
                         jobs.append(job)
             if len(jobs) > limit:
@@ -103,6 +106,9 @@ class JobQueue:
             return self.store.listed_folder(job_id).spec()
         except (JobDamaged, JobNotFound):
             return UNREADABLE_SPEC
+
+    def _listed_spec(self, job_id: str) -> JobSpec:
+        return self._known.recent_spec(job_id) or self.spec(job_id)
 
     def cancel(self, job_id: str) -> Job:
         """Stop a queued or running job; it keeps its checkpoint. A cancelled job does not change."""

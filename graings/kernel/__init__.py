@@ -2,6 +2,7 @@
 
 from graings.kernel.extension import active_isa as active_isa
 from graings.kernel.extension import available_isas as available_isas
+from graings.kernel.extension import call as call
 from graings.kernel.extension import keep_freed_memory as keep_freed_memory
 from graings.kernel.extension import kernel as kernel
 from graings.kernel.extension import use_isa as use_isa

@@ -1,6 +1,7 @@
 """The compiled extension, built from `csrc/`, and the instruction set it uses.
 
-All other modules access the extension through `kernel()`, which raises an error with a remedy if it cannot be loaded.
+Other modules access the extension through `kernel()`, which raises an error with a remedy if it cannot be loaded, or
+through `call`.
 """
 
 from __future__ import annotations
@@ -8,6 +9,9 @@ from __future__ import annotations
 import importlib
 from functools import cache
 from types import ModuleType
+from typing import Any
+
+from torch import Tensor
 
 from graings.errors import KernelError
 
@@ -36,6 +40,21 @@ def kernel() -> ModuleType:
     except ValueError as error:
         raise KernelError(f"GRAINGS_ISA: {error}") from error
     return module
+
+
+def call(function: str, *arguments: Any) -> Any:
+    """What a function of the extension returns. `arguments` may be tensors and lists of them, without gradients.
+
+    Tensors are handed over as NumPy arrays of their memory. nanobind would ask each of them for a DLPack capsule, in
+    Python: 7 microseconds instead of 2, and an image takes 45 tensors.
+    """
+    return getattr(kernel(), function)(*map(_handed_over, arguments))
+
+
+def _handed_over(argument: Any) -> Any:
+    if isinstance(argument, Tensor):
+        return argument.numpy()
+    return [_handed_over(one) for one in argument] if isinstance(argument, list) else argument
 
 
 def active_isa() -> str:

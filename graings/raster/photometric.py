@@ -76,7 +76,7 @@ class _Photometric(torch.autograd.Function):
         first, second = image.detach().contiguous(), target.detach().contiguous()
         gradient = torch.empty_like(first) if ctx.needs_input_grad[0] else None
         height, width, _ = image.shape
-        means = kernel.kernel().compare(first, second, height, width, *weights, gradient, threads)
+        means = kernel.call("compare", first, second, height, width, *weights, gradient, threads)
         if gradient is not None:
             ctx.save_for_backward(gradient)
         return image.new_tensor(sum(weight * mean for weight, mean in zip(weights, means, strict=True)))

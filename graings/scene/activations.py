@@ -56,5 +56,5 @@ def sigmoid(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def _values(x: Tensor, function: int) -> Tensor:
     numbers = x.detach().contiguous()
     values = torch.empty_like(numbers)
-    kernel.kernel().activate(function, numbers, values, kernel.thread_count())
+    kernel.call("activate", function, numbers, values, kernel.thread_count())
     return values

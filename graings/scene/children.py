@@ -128,7 +128,7 @@ class _Gather(torch.autograd.Function):
         count = len(children)
         inputs = anchors.new_empty(count, 3 + offsets.shape[1])
         means, anchor_log_scales = anchors.new_empty(count, 3), anchors.new_empty(count, 3)
-        kernel.kernel().gather(*tensors, children, inputs, means, anchor_log_scales, threads)
+        kernel.call("gather", *tensors, children, inputs, means, anchor_log_scales, threads)
         ctx.save_for_backward(*tensors, children)
         ctx.threads = threads
         return inputs, means, anchor_log_scales
@@ -139,7 +139,7 @@ class _Gather(torch.autograd.Function):
         anchors, log_scales, offsets, children = ctx.saved_tensors
         gradients: list[Tensor | None] = [torch.empty_like(t) for t in (log_scales, offsets)]
         upstream = [v.contiguous() for v in (v_inputs, v_means, v_anchor_log_scales)]
-        kernel.kernel().gather_gradient(anchors, log_scales, offsets, children, *upstream, *gradients, ctx.threads)
+        kernel.call("gather_gradient", anchors, log_scales, offsets, children, *upstream, *gradients, ctx.threads)
         v_anchors = None
         if ctx.needs_input_grad[2]:
             v_anchors = torch.zeros_like(anchors).index_add_(0, children // offsets.shape[1], upstream[1])
@@ -163,7 +163,7 @@ class _Compose(torch.autograd.Function):
         means, quats = torch.empty_like(canonical_means), canonical_means.new_empty(len(canonical_means), 4)
         log_scales = torch.empty_like(canonical_means)
         ctx.constants = (extent, MAX_LOG_SCALE_OFFSET, *LOG_SCALE_RANGE, projected)
-        kernel.kernel().compose(*tensors, *ctx.constants, means, quats, log_scales, threads)
+        kernel.call("compose", *tensors, *ctx.constants, means, quats, log_scales, threads)
         ctx.save_for_backward(*tensors)
         ctx.threads = threads
         return means, quats, log_scales
@@ -176,5 +176,5 @@ class _Compose(torch.autograd.Function):
         v_deformation = None if deformation is None else torch.empty_like(deformation)
         inputs = (canonical, anchor_log_scales, canonical_means, deformation)
         upstream = [v.contiguous() for v in (v_means, v_quats, v_log_scales)]
-        kernel.kernel().compose_gradient(*inputs, *ctx.constants, *upstream, v_canonical, v_deformation, ctx.threads)
+        kernel.call("compose_gradient", *inputs, *ctx.constants, *upstream, v_canonical, v_deformation, ctx.threads)
         return v_canonical, v_canonical[:, 4:], v_means, v_deformation, None, None, None

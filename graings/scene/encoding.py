@@ -40,7 +40,7 @@ def frequency_encoding(x: Float[Tensor, "*batch dim"], octaves: int) -> Float[Te
     if x.requires_grad and torch.is_grad_enabled():
         return plain_frequency_encoding(x, octaves)
     encoded = x.new_empty(*x.shape[:-1], encoding_width(x.shape[-1], octaves))
-    kernel.kernel().encode(x.detach().contiguous(), x.shape[-1], octaves, encoded, kernel.thread_count())
+    kernel.call("encode", x.detach().contiguous(), x.shape[-1], octaves, encoded, kernel.thread_count())
     return encoded
 
 
@@ -64,7 +64,7 @@ def directions_from(eye: ArrayLike, positions: Float[Tensor, "*batch 3"]) -> Flo
     """Unit vectors from `eye` [3] to `positions`, which get no gradient; shorter within `constants.NEAR` of the eye."""
     directions = torch.empty_like(positions)
     at = np.asarray(eye, dtype=np.float64).ravel()
-    kernel.kernel().directions(positions.detach().contiguous(), at, constants.NEAR, directions, kernel.thread_count())
+    kernel.call("directions", positions.detach().contiguous(), at, constants.NEAR, directions, kernel.thread_count())
     return directions
 
 
@@ -126,7 +126,7 @@ class _DirectionEncoding(torch.autograd.Function):
         normals = None if normals is None else normals.detach().contiguous()
         width = direction_width(degree) * (1 if normals is None else 2)
         encoded = directions.new_empty(*directions.shape[:-1], width)
-        kernel.kernel().encode_directions(directions, normals, degree, encoded, threads)
+        kernel.call("encode_directions", directions, normals, degree, encoded, threads)
         ctx.save_for_backward(directions, normals)
         ctx.constants = (degree, threads)
         return encoded
@@ -137,7 +137,7 @@ class _DirectionEncoding(torch.autograd.Function):
         directions, normals = ctx.saved_tensors
         degree, threads = ctx.constants
         v_normals = torch.empty_like(normals)
-        kernel.kernel().encode_directions_gradient(
-            directions, normals, degree, upstream.contiguous(), v_normals, threads
+        kernel.call(
+            "encode_directions_gradient", directions, normals, degree, upstream.contiguous(), v_normals, threads
         )
         return None, v_normals, None, None

@@ -96,10 +96,10 @@ class _Perceptron(torch.autograd.Function):
         output = inputs.new_empty(len(inputs), len(biases[-1]))
         hidden: Tensor | None = None
         if any(ctx.needs_input_grad):
-            hidden = inputs.new_empty(kernel.kernel().hidden_size([inputs.shape[1], *map(len, biases)], len(inputs)))
+            hidden = inputs.new_empty(kernel.call("hidden_size", [inputs.shape[1], *map(len, biases)], len(inputs)))
             ctx.save_for_backward(hidden, groups, *contiguous)
             ctx.threads = threads
-        kernel.kernel().network(inputs, weights, biases, shared, groups, output, hidden, threads)
+        kernel.call("network", inputs, weights, biases, shared, groups, output, hidden, threads)
         return output
 
     @staticmethod
@@ -111,7 +111,7 @@ class _Perceptron(torch.autograd.Function):
         v_shared = None if shared is None else torch.empty_like(shared)
         v_weights, v_biases = [torch.empty_like(w) for w in weights], [torch.empty_like(b) for b in biases]
         layers, gradients = (inputs, weights, biases, shared, groups), (v_inputs, v_weights, v_biases, v_shared)
-        kernel.kernel().network_gradient(*layers, hidden, upstream.contiguous(), *gradients, ctx.threads)
+        kernel.call("network_gradient", *layers, hidden, upstream.contiguous(), *gradients, ctx.threads)
         return None, None, v_inputs, *v_weights, *v_biases, *([] if v_shared is None else [v_shared])
 
 

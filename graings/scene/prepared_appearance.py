@@ -66,7 +66,7 @@ class BasisResidual:
         """Of all children, and of some rows that fill the last block."""
         found = self._state.new_empty(len(self._state) * BLOCK, 4)
         functions = interpolated(self._functions, time).contiguous()
-        kernel.kernel().blend(*self._weights, self._state, functions, found, kernel.thread_count())
+        kernel.call("blend", *self._weights, self._state, functions, found, kernel.thread_count())
         return found
 
     def tensors(self) -> Iterable[Tensor]:
@@ -164,7 +164,7 @@ class PreparedAppearance:
                 blended, changed = self._basis.at(time), self._positions.new_empty(count, 3)
         bounds = (0.0 if self._residual is None else self._residual.scale, constants.ALPHA_MIN)
         inputs = (*candidates, opacities, *network, blended, *bounds)
-        count = kernel.kernel().choose(*inputs, *found, changed, kernel.thread_count())
+        count = kernel.call("choose", *inputs, *found, changed, kernel.thread_count())
         if changed is not None:
             changes = Changes(None, biases, None if biases else changed[:count])
         return Rendered._make(part[:count] for part in found), changes
@@ -196,7 +196,7 @@ class PreparedAppearance:
             (None, None, None) if frustum is None or geometry is None else (frustum.packed(), geometry[0], geometry[2])
         )
         inputs = (self._positions, *self._canonical, *network, time_only, blended, scale, *view, children, *where)
-        kernel.kernel().paint(*inputs, colors, kernel.thread_count())
+        kernel.call("paint", *inputs, colors, kernel.thread_count())
         return colors
 
 

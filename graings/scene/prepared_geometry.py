@@ -165,5 +165,5 @@ def move(
     """
     geometry = rest.new_empty(len(rows), 3), rest.new_empty(len(rows), 4), rest.new_empty(len(rows), 3)
     bounds = (extent, largest_change, *LOG_SCALE_RANGE)
-    kernel.kernel().move(*hidden, rest, weights.contiguous(), bias, *bounds, rows, *geometry, kernel.thread_count())
+    kernel.call("move", *hidden, rest, weights.contiguous(), bias, *bounds, rows, *geometry, kernel.thread_count())
     return geometry

@@ -19,8 +19,9 @@ from jobs.store import JobFolder
 
 @pytest.fixture
 def settled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Jobs count as settled at once when they have ended."""
+    """Jobs count as settled at once when they have ended, and each list looks at their files."""
     monkeypatch.setattr(known_jobs, "SETTLED_S", -60.0)
+    monkeypatch.setattr(known_jobs, "RECENT_S", 0.0)
 
 
 def submit(jobs: JobQueue, name: str = "job") -> str:
@@ -102,11 +103,36 @@ def test_a_deleted_job_is_not_listed_and_a_repaired_one_is_read(jobs: JobQueue) 
     assert [(job.id, job.error) for job in listed(jobs)] == [(kept, None)]
 
 
+@pytest.mark.usefixtures("settled")
+def test_files_that_were_just_looked_at_are_not_looked_at_again_for_a_second(
+    jobs: JobQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(known_jobs, "RECENT_S", 1.0)
+    clock = 100.0
+    monkeypatch.setattr(known_jobs, "monotonic", lambda: clock)
+    folder = jobs.store.folder(ended(jobs))
+    assert not listed(jobs)[0].has_metrics
+    write_json(folder.run / METRICS_FILE, {})
+    clock += 0.9
+    assert not listed(jobs)[0].has_metrics
+    clock += 0.2  # 1.1 s after the first look: the second list was none
+    assert listed(jobs)[0].has_metrics
+    (folder.run / METRICS_FILE).unlink()
+    assert listed(jobs)[0].has_metrics
+    assert not jobs.get(folder.path.name).has_metrics  # one job is always looked at
+    assert not listed(jobs)[0].has_metrics
+    jobs.resume(folder.path.name)
+    assert listed(jobs)[0].state is JobState.QUEUED  # the queue too
+    jobs.delete(folder.path.name)
+    assert listed(jobs) == []
+
+
 @pytest.mark.parametrize("settled_s", [60.0, -60.0])
 def test_a_job_that_is_deleted_while_the_list_is_made_is_not_in_it(
     jobs: JobQueue, monkeypatch: pytest.MonkeyPatch, settled_s: float
 ) -> None:
     monkeypatch.setattr(known_jobs, "SETTLED_S", settled_s)
+    monkeypatch.setattr(known_jobs, "RECENT_S", 0.0)
     kept, gone = ended(jobs), ended(jobs)
     assert [job.id for job in listed(jobs)] == [gone, kept]
 
@@ -119,6 +145,7 @@ def test_a_job_that_is_deleted_while_the_list_is_made_is_not_in_it(
     assert [job.id for job in jobs.page(10, wanted=wanted)[0]] == [kept]
 
 
+@pytest.mark.usefixtures("settled")
 def test_the_specification_of_a_job_is_looked_at_once_for_a_list(
     jobs: JobQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
