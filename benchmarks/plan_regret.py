@@ -1,11 +1,13 @@
 """What leaving a part out costs in quality, and what it saves: every automatic drop of the plan, with and without.
 
     python benchmarks/plan_regret.py FOLDER [--size 100] [--views 60] [--iterations 400] [--only PART ...]
+        [--captures CAPTURE ...]
 
 Writes the captures it needs and the runs into FOLDER, leaves out what is finished, and prints a Markdown table: mean
 PSNR of the validation views with and without the part, the 95 % interval of the paired difference (Student's t over the
 seeds), CPU seconds of training, bytes of the model in float32, predicted and measured saving. The same seed is paired,
-and named random streams keep the numbers of what stays. One thread, preset draft.
+and named random streams keep the numbers of what stays. One thread, preset draft, images of at most SIZE pixels a side.
+With --captures the deformation of further captures, of one time, is looked at too.
 """
 
 from __future__ import annotations
@@ -106,8 +108,11 @@ def write_noisy(pixels: np.ndarray, path: Path, random: np.random.Generator) -> 
     output.close()
 
 
-def capture_of(folder: Path, scene: str, size: int, views: int) -> Path:
-    """The capture, written where it is missing."""
+def capture_of(folder: Path, scene: str, size: int, views: int, given: list[Path]) -> Path:
+    """The capture: one of those given, or a synthetic one, written where it is missing."""
+    for path in given:
+        if path.name == scene:
+            return path
     place = folder / "captures" / scene
     if not (place / "transforms_train.json").exists():
         shutil.rmtree(place, ignore_errors=True)
@@ -161,13 +166,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--only", nargs="+", help="parts, as the table names them")
     parser.add_argument("--scenes", nargs="+", help="scenes, as the table names them")
+    parser.add_argument("--captures", type=Path, nargs="+", default=[])
     options = parser.parse_args()
     calibration(1)
     lines = []
-    for case in CASES:
+    added = [Case("deformation", path.name, {"plan.keep": ["deformation"]}, {}) for path in options.captures]
+    for case in (*CASES, *added):
         if case.part not in (options.only or [case.part]) or case.scene not in (options.scenes or [case.scene]):
             continue
-        capture = capture_of(options.folder, case.scene, options.size, options.views)
+        capture = capture_of(options.folder, case.scene, options.size, options.views, options.captures)
         pairs, plan = [], None
         for seed in options.seeds:
             pair = []
@@ -176,6 +183,7 @@ def main() -> None:
                 key = "-".join(f"{k}={v}" for k, v in sorted(side.items())) or "default"
                 run = options.folder / "runs" / case.scene / "".join(c if c.isalnum() else "_" for c in key) / str(seed)
                 common = {"iterations": options.iterations, "threads": 1, "seed": seed, "time_window": 1.0}
+                common["capture.max_side"] = options.size
                 metrics, plan = trained(run, capture, {**common, **side})
                 pair.append(metrics)
             pairs.append((pair[0], pair[1]))

@@ -59,6 +59,11 @@ def test_one_time_needs_neither_deformation_nor_residual_nor_temporal_loss(tmp_p
     assert verdict(plan, "temporal_loss") == verdict(plan, "rigidity") == ("drop", "exact")
     applied = plan.apply(config)
     assert (applied.scene.deformation, applied.scene.residual, applied.loss.temporal) == ("none", False, 0.0)
+    first, last = config.rates.offsets
+    assert applied.rates.offsets == (2 * first, last)
+    assert plan.apply(applied) == applied
+    left_out = make_config("draft", {"scene.deformation": "none"})
+    assert make_plan(statistics_of(folder), left_out).apply(left_out).rates == config.rates  # of a user: as asked for
     reason = plan.decision("deformation")
     assert reason is not None
     assert "1 distinct training time" in reason.reason
