@@ -104,7 +104,7 @@ def _deformation(statistics: CaptureStatistics, config: TrainConfig) -> Decision
     if _kept(config, "deformation"):
         return _kept_by_option(config, "deformation", one if one.holds else still)
     if one.holds:
-        reason = "1 distinct training time: the canonical state is the only one; child offsets begin at twice their rate"
+        reason = "1 distinct training time: the canonical state is all there is; offsets start at twice their rate"
         return _dropped("deformation", "representable", reason, one)
     if statistics.change is None:
         reason = MONOCULAR if statistics.camera_motion != "fixed" else "not every fixed camera could be looked at"
