@@ -4,8 +4,8 @@ A caller shows a key in `Authorization: Bearer`, or a browser the session it was
 `read` and everything else `train`, except for the operations in `NEEDS`. A job belongs to the key that made it: to
 others it does not exist. Without any key, a service that only this machine can reach lets everybody do everything.
 
-Dependencies are coroutines here and elsewhere: FastAPI gives every other function a thread, and each of them waits for a
-core and for the interpreter.
+Dependencies are coroutines here and elsewhere: FastAPI gives every other function a thread, and each of them waits for
+a core and for the interpreter.
 """
 
 from __future__ import annotations
