@@ -16,10 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from runs import finished, train
+
 from graings.config import TrainConfig, make_config
-from graings.report.metrics_document import Metrics, read_metrics
-from graings.storage.run_folder import METRICS_FILE, RECORD_FILE
-from graings.training.run import TrainingRun
 
 FINE = make_config("fine")
 BATCH = FINE.batch
@@ -110,24 +109,6 @@ def check_ladder(views: int) -> None:
     different = [key for key in fine if key != "preset" and end[key] != fine[key]]
     if different:
         raise SystemExit(f"the last row is not fine: {different}. Add the options to a row.")
-
-
-def train(folder: Path, capture: Path, config: TrainConfig) -> None:
-    """Train a run to its end, or resume it; nothing where it is finished."""
-    if finished(folder) is not None:
-        return
-    run = TrainingRun.resume(folder) if (folder / RECORD_FILE).exists() else TrainingRun.create(capture, folder, config)
-    for report in run:
-        if report.evaluation is not None:
-            print(f"{folder.name}  {report.iteration:,}  {report.evaluation.psnr:.2f} dB", flush=True)
-
-
-def finished(folder: Path) -> Metrics | None:
-    """Metrics of the last iteration."""
-    if not (folder / METRICS_FILE).exists():
-        return None
-    metrics = read_metrics(folder / METRICS_FILE)
-    return metrics if "val" in metrics.splits else None
 
 
 def table(folder: Path, captures: list[Path]) -> Iterator[str]:
