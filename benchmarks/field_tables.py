@@ -59,9 +59,15 @@ def table(folder: Path, captures: list[Path], protocol: Protocol) -> Iterator[st
         if metrics is None or "test" not in metrics.splits:
             continue
         yield row(capture.name, metrics, protocol)
-        means.append(metrics.splits["test"].psnr or 0.0)
+        psnr = metrics.splits["test"].psnr
+        if psnr is not None:
+            means.append(psnr)
     if means:
         yield f"| mean of {len(means)} | {sum(means) / len(means):.2f} |" + " |" * (len(heads) - 1)
+
+
+def number(value: float | None, digits: int) -> str:
+    return "null" if value is None else f"{value:.{digits}f}"
 
 
 def row(name: str, metrics: Metrics, protocol: Protocol) -> str:
@@ -69,11 +75,11 @@ def row(name: str, metrics: Metrics, protocol: Protocol) -> str:
     published = protocol.published.get(name)
     cells = (
         name,
-        f"{test.psnr:.2f}",
-        f"{test.ssim_3dgs:.4f}",
-        "null" if test.lpips_vgg is None else f"{test.lpips_vgg:.4f}",
-        f"{min(view.psnr for view in test.views):.1f}",
-        f"{val.psnr:.2f}",
+        number(test.psnr, 2),
+        number(test.ssim_3dgs, 4),
+        number(test.lpips_vgg, 4),
+        number(min((view.psnr for view in test.views), default=None), 1),
+        number(val.psnr, 2),
         f"{metrics.train_cpu_s / 60:.0f}",
         f"{metrics.gaussians}",
         f"{metrics.anchors}",

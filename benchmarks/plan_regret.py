@@ -23,15 +23,15 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+from runs import finished, train
 
 from graings.capture.image_file import decode
 from graings.capture.synthetic import synthesize
 from graings.config import make_config
 from graings.plan.plan import Plan
-from graings.report.metrics_document import Metrics, read_metrics
+from graings.report.metrics_document import Metrics
 from graings.report.run_record import read_plan
 from graings.training.calibration import calibration
-from graings.training.run import TrainingRun
 
 T_95 = {
     1: 12.706,
@@ -126,16 +126,14 @@ def capture_of(folder: Path, scene: str, size: int, views: int, given: list[Path
 
 
 def trained(run: Path, capture: Path, options: dict[str, Any]) -> tuple[Metrics, Plan]:
-    """Metrics and plan of a run, which is trained where it is not finished."""
+    """Metrics and plan of a run, which is trained, or resumed, where it is not finished."""
     config = make_config("draft", options)
-    if not (run / "model.graings").exists():
-        shutil.rmtree(run, ignore_errors=True)
-        for _ in TrainingRun.create(capture, run, config):
-            pass
-        print(f"{run}: {read_metrics(run / 'metrics.json').train_cpu_s:.0f} CPU s", flush=True)
-    plan = read_plan(run)
+    train(run, capture, config)
+    metrics, plan = finished(run), read_plan(run)
+    assert metrics is not None
     assert plan is not None
-    return read_metrics(run / "metrics.json"), plan
+    print(f"{run}: {metrics.train_cpu_s:.0f} CPU s", flush=True)
+    return metrics, plan
 
 
 def row(case: Case, pairs: list[tuple[Metrics, Metrics]], plan: Plan) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from graings.config import TrainConfig
 from graings.report.metrics_document import Metrics, read_metrics
+from graings.report.run_record import read_record
 from graings.storage.run_folder import METRICS_FILE, RECORD_FILE
 from graings.training.run import TrainingRun
 
@@ -19,10 +20,27 @@ def finished(folder: Path) -> Metrics | None:
 
 
 def train(folder: Path, capture: Path, config: TrainConfig) -> None:
-    """Train a run to its end, or resume it; nothing where it is finished."""
+    """Train a run to its end, or resume it; nothing where it is finished.
+
+    Raises `SystemExit` where the run in `folder` is of another capture or has other options: its numbers would be
+    taken for those that were asked for.
+    """
+    begun = (folder / RECORD_FILE).exists()
+    if begun:
+        check(folder, capture, config)
     if finished(folder) is not None:
         return
-    run = TrainingRun.resume(folder) if (folder / RECORD_FILE).exists() else TrainingRun.create(capture, folder, config)
+    run = TrainingRun.resume(folder) if begun else TrainingRun.create(capture, folder, config)
     for report in run:
         if report.evaluation is not None:
             print(f"{folder.name}  {report.iteration:,}  {report.evaluation.psnr:.2f} dB", flush=True)
+
+
+def check(folder: Path, capture: Path, config: TrainConfig) -> None:
+    record = read_record(folder)
+    old, new = record.config.model_dump(), config.model_dump()
+    different = [name for name in new if old[name] != new[name] and name != "threads"]
+    if Path(record.capture.path).resolve() != capture.resolve():
+        different.append("capture")
+    if different:
+        raise SystemExit(f"{folder}: a run with other {', '.join(different)}. Give another folder.")
