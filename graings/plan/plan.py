@@ -16,7 +16,7 @@ from graings.document import Document
 from graings.plan.capture_statistics import CaptureStatistics
 from graings.plan.cost import Calibration, Prediction, predict
 from graings.plan.decision import Component, Decision, Saving
-from graings.plan.rules import contradictions, decide
+from graings.plan.rules import contradictions, decide, rate_of_preset
 
 # DeformNet also helps children to find their place. Without it, three captures of one time gain 0.15 to 0.18 dB with
 # twice the first rate of the child offsets (docs/experiments/training-speed.md).
@@ -66,7 +66,8 @@ class Plan(Document):
 def without(config: TrainConfig, components: Sequence[Component]) -> TrainConfig:
     """`config` without some components. Those that no option switches are left as they are.
 
-    Where this takes the deformation away, the first rate of the child offsets is multiplied by `OFFSETS_FACTOR`.
+    Where this takes the deformation away, the first rate of the child offsets is multiplied by `OFFSETS_FACTOR`, unless
+    `rates.offsets` is not that of the preset: an option that was set stays as it is.
     """
     scene: dict[str, object] = {}
     loss: dict[str, object] = {}
@@ -74,7 +75,8 @@ def without(config: TrainConfig, components: Sequence[Component]) -> TrainConfig
     if "deformation" in components and config.scene.deformation != "none":
         scene["deformation"] = "none"
         first, last = config.rates.offsets
-        rates["offsets"] = OFFSETS_FACTOR * first, last
+        if rate_of_preset(config):
+            rates["offsets"] = OFFSETS_FACTOR * first, last
     if "residual" in components:
         scene["residual"] = False
     for component, weight in (("temporal_loss", "temporal"), ("rigidity", "rigidity"), ("alpha_loss", "alpha")):

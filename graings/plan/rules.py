@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
-from graings.config import PRESETS, Part, TrainConfig
+from graings.config import PRESETS, Part, TrainConfig, make_config
 from graings.plan.capture_statistics import CaptureStatistics
 from graings.plan.cost import expected_anchors
 from graings.plan.decision import Bound, Component, Condition, Decision, Kind
@@ -42,6 +41,11 @@ def decide(statistics: CaptureStatistics, config: TrainConfig) -> list[Decision]
         _growth(config),
         _preset(statistics, config),
     ]
+
+
+def rate_of_preset(config: TrainConfig) -> bool:
+    """Whether the child offsets have the rate of the preset: one that was set is the user's decision."""
+    return config.rates.offsets == make_config(config.preset).rates.offsets
 
 
 def nothing_shown(statistics: CaptureStatistics) -> list[str]:
@@ -104,7 +108,8 @@ def _deformation(statistics: CaptureStatistics, config: TrainConfig) -> Decision
     if _kept(config, "deformation"):
         return _kept_by_option(config, "deformation", one if one.holds else still)
     if one.holds:
-        reason = "1 distinct training time: the canonical state is all there is; offsets start at twice their rate"
+        reason = "1 distinct training time: the canonical state is all there is"
+        reason += "; offsets start at twice their rate" if rate_of_preset(config) else ""
         return _dropped("deformation", "representable", reason, one)
     if statistics.change is None:
         reason = MONOCULAR if statistics.camera_motion != "fixed" else "not every fixed camera could be looked at"
@@ -268,9 +273,8 @@ def _preset(statistics: CaptureStatistics, config: TrainConfig) -> Decision:
 
 
 def _dropped(component: Component, kind: Kind, reason: str, condition: Condition | None) -> Decision:
-    keepable: Sequence[str] = ("deformation", "residual", "alpha_loss")
     bound = Bound(value=0.0, how="the same computation" if kind == "exact" else "the other parts reach the same images")
-    override = {"plan.keep": [component]} if component in keepable else None
+    override = {"plan.keep": [component]} if component in ("deformation", "residual", "alpha_loss") else None
     return Decision(
         component=component,
         decision="drop",

@@ -69,6 +69,16 @@ def test_one_time_needs_neither_deformation_nor_residual_nor_temporal_loss(tmp_p
     assert "1 distinct training time" in reason.reason
 
 
+def test_a_rate_that_was_set_is_not_doubled() -> None:
+    config = make_config("draft", {"rates.offsets": (0.01, 1e-3)})
+    plan = make_plan(FACTS.model_copy(update={"times": 1}), config)
+    assert plan.apply(config).scene.deformation == "none"
+    assert plan.apply(config).rates == config.rates
+    decision = plan.decision("deformation")
+    assert decision is not None
+    assert "rate" not in decision.reason
+
+
 def test_two_times_keep_them() -> None:
     """The counter-scene of the test above."""
     plan = plan_of({"times": 2, **MONOCULAR})

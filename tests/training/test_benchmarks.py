@@ -1,0 +1,69 @@
+"""The scripts in `benchmarks/` that train: what they take for the run that was asked for."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from tests.training.micro import micro_config
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def scripts(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Imports a script of `benchmarks/` by its name."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+
+    def load(name: str) -> ModuleType:
+        return importlib.import_module(name)
+
+    return load
+
+
+def test_the_last_row_of_the_ladder_is_fine(scripts: Any) -> None:
+    """An option that `fine` and `paper` set differently and no row takes would be worth nothing in the table."""
+    ladder = scripts("ladder")
+    ladder.check_ladder(20_000)
+    names = [name for row in ladder.ROWS for name in row.options]
+    assert len(names) == len(set(names))
+    assert ladder.config_of(0, 20_000, 0, 1).batch == 1
+    assert ladder.config_of(len(ladder.ROWS) - 1, 20_000, 0, 1).iterations == 5_000
+
+
+def test_a_ladder_that_misses_an_option_is_refused(scripts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    ladder = scripts("ladder")
+    monkeypatch.setattr(ladder, "ROWS", ladder.ROWS[:-1])
+    with pytest.raises(SystemExit, match=r"not fine.*time_window"):
+        ladder.check_ladder(20_000)
+
+
+@pytest.mark.slow(reason="a training with its report")
+def test_a_run_is_finished_once_and_refused_with_other_options(scripts: Any, micro: Path, tmp_path: Path) -> None:
+    runs = scripts("runs")
+    folder, config = tmp_path / "run", micro_config(iterations=5)
+    assert runs.finished(folder) is None
+    runs.train(folder, micro, config)
+    metrics = runs.finished(folder)
+    written = (folder / "metrics.json").stat().st_mtime_ns
+    runs.train(folder, micro, config.model_copy(update={"threads": 2}))  # threads change no number
+    assert runs.finished(folder) == metrics is not None
+    assert (folder / "metrics.json").stat().st_mtime_ns == written
+    with pytest.raises(SystemExit, match="other seed"):
+        runs.train(folder, micro, config.model_copy(update={"seed": 1}))
+    with pytest.raises(SystemExit, match="other capture"):
+        runs.train(folder, tmp_path / "elsewhere" / "micro", config)
+
+
+def test_published_numbers_stand_beside_their_own_protocol(scripts: Any) -> None:
+    """Means of seven scenes as the projects publish them, in dB."""
+    tables = scripts("field_tables")
+    means = {"white-800": 38.64, "black-400": 43.31, "black-800": 42.41}
+    for name, mean in means.items():
+        protocol = tables.PROTOCOLS[name]
+        assert sum(protocol.published.values()) / 7 == pytest.approx(mean, abs=0.006)
+        assert name == f"{protocol.background}-{protocol.max_side}"
