@@ -35,9 +35,7 @@ class Row:
 
 ROWS = (
     Row("printed", "the method as printed", ()),
-    Row(
-        "batch", "four views a step, short warm-up, growth as often per view", ("batch", "warmup", "density.grow_every")
-    ),
+    Row("batch", "four views a step, short warm-up, growth every 50 steps", ("batch", "warmup", "density.grow_every")),
     Row("time", "time conditioning factorized", ("scene.time_conditioning",)),
     Row(
         "losses",

@@ -28,7 +28,7 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
     },
     "standard": {},
     "fine": {"iterations": 15_000},
-    # One view per step, with all of our additions. Growth is half as frequent per view as with batches of four.
+    # One view per step, with all of our additions. Growth is twice as frequent per view as with batches of four.
     "long": {
         "iterations": PAPER_ITERATIONS,
         "batch": 1,
