@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
@@ -14,8 +13,9 @@ from typing import Any, TypeVar
 import httpx2
 
 from client import calls
-from client.answers import ClientError, Event, RemoteJob
+from client.answers import ClientError, Event, RefusedError, RemoteJob
 from client.captures import Observe, packed, uploading
+from client.patience import Patience, passes
 
 T = TypeVar("T")
 
@@ -51,8 +51,8 @@ class AsyncClient:
         `webhook` is an address that is told what happens; `webhook_secret` in the document of the answer verifies its
         messages.
         """
+        named = calls.job_name(name, capture)
         upload_id = await self.upload(capture, observe)
-        named = name or Path(capture).stem
         return await self._do(calls.submit(upload_id, named, preset, config, priority, webhook, uuid.uuid4().hex))
 
     async def upload(self, capture: Path | str, observe: Observe | None = None) -> str:
@@ -96,7 +96,7 @@ class AsyncClient:
 
     async def events(self, job_id: str, after: str | None = None) -> AsyncIterator[Event]:
         """What happens to a job, until it has ended; a broken connection is opened again where it broke."""
-        heard = time.monotonic()
+        patience = Patience()
         while True:
             headers = {} if after is None else {"Last-Event-ID": after}
             try:
@@ -104,14 +104,19 @@ class AsyncClient:
                     if not stream.response.is_success:
                         await stream.response.aread()
                         calls.read(stream.response, lambda response: None)
+                    patience.succeeded()
                     async for event in stream:
-                        after, heard = event.id or after, time.monotonic()
+                        after = event.id or after
                         yield Event(event.event, event.json())  # type: ignore[arg-type]
                         if event.event == "end":
                             return
             except httpx2.TransportError as error:
-                if time.monotonic() - heard > calls.PATIENCE_S:
-                    raise ClientError(calls.no_answer(self._http.base_url, error)) from error
+                patience.failed(ClientError(calls.no_answer(self._http.base_url, error)))
+            except RefusedError as error:
+                if not passes(error):
+                    raise
+                patience.failed(error)
+            patience.check()
             await asyncio.sleep(calls.RECONNECT_S)
 
     async def wait(self, job_id: str, observe: Callable[[Event], None] | None = None) -> RemoteJob:
@@ -160,7 +165,7 @@ class AsyncClient:
         metrics: dict[str, Any] = json.loads(content)
         return metrics
 
-    async def video(self, job_id: str, path: Path | str, **options: Any) -> Path:
+    async def video(self, job_id: str, path: Path | str, /, **options: Any) -> Path:
         """Have a video made and write it to `path`, whose suffix is its format; waits for it.
 
         `options` are the fields of the body of `POST /jobs/{id}/videos`, such as seconds=4, moves="time", width=400.

@@ -12,8 +12,9 @@ from typing import Any, TypeVar
 import httpx2
 
 from client import calls
-from client.answers import ClientError, Event, RemoteJob
+from client.answers import ClientError, Event, RefusedError, RemoteJob
 from client.captures import Observe, packed, uploading
+from client.patience import Patience, passes
 
 T = TypeVar("T")
 
@@ -53,8 +54,8 @@ class Client:
         `webhook` is an address that is told what happens; `webhook_secret` in the document of the answer verifies its
         messages.
         """
+        named = calls.job_name(name, capture)
         upload_id = self.upload(capture, observe)
-        named = name or Path(capture).stem
         return self._do(calls.submit(upload_id, named, preset, config, priority, webhook, uuid.uuid4().hex))
 
     def upload(self, capture: Path | str, observe: Observe | None = None) -> str:
@@ -94,7 +95,7 @@ class Client:
 
     def events(self, job_id: str, after: str | None = None) -> Iterator[Event]:
         """What happens to a job, until it has ended; a broken connection is opened again where it broke."""
-        heard = time.monotonic()
+        patience = Patience()
         while True:
             headers = {} if after is None else {"Last-Event-ID": after}
             try:
@@ -102,14 +103,19 @@ class Client:
                     if not stream.response.is_success:
                         stream.response.read()
                         calls.read(stream.response, lambda response: None)
+                    patience.succeeded()
                     for event in stream:
-                        after, heard = event.id or after, time.monotonic()
+                        after = event.id or after
                         yield Event(event.event, event.json())  # type: ignore[arg-type]
                         if event.event == "end":
                             return
             except httpx2.TransportError as error:
-                if time.monotonic() - heard > calls.PATIENCE_S:
-                    raise ClientError(calls.no_answer(self._http.base_url, error)) from error
+                patience.failed(ClientError(calls.no_answer(self._http.base_url, error)))
+            except RefusedError as error:
+                if not passes(error):
+                    raise
+                patience.failed(error)
+            patience.check()
             time.sleep(calls.RECONNECT_S)
 
     def wait(self, job_id: str, observe: Callable[[Event], None] | None = None) -> RemoteJob:
@@ -158,7 +164,7 @@ class Client:
         metrics: dict[str, Any] = json.loads(content)
         return metrics
 
-    def video(self, job_id: str, path: Path | str, **options: Any) -> Path:
+    def video(self, job_id: str, path: Path | str, /, **options: Any) -> Path:
         """Have a video made and write it to `path`, whose suffix is its format; waits for it.
 
         `options` are the fields of the body of `POST /jobs/{id}/videos`, such as seconds=4, moves="time", width=400.

@@ -19,8 +19,8 @@ Query = Mapping[str, Any]
 TIMEOUT = httpx2.Timeout(120.0, connect=10.0)  # an image of a large scene, or the inspection of a large capture
 RECONNECT_S = 1.0
 POLL_S = 0.5
-PATIENCE_S = 60.0  # a service that restarts is back sooner
 ATTEMPTS = 6
+NAME_LENGTH = 120
 RESULTS = ("model", "metrics", "plan", "report", "log", "curve.svg", "report.svg")
 
 
@@ -79,6 +79,11 @@ def submit(
     return Call("POST", "/jobs", _job, query, {"Idempotency-Key": key})
 
 
+def job_name(name: str | None, capture: Path | str) -> str:
+    """The name of a job: that of its capture unless another is given, as long as the service takes it."""
+    return (name or Path(capture).resolve().stem)[:NAME_LENGTH]
+
+
 def begin_upload(size: int) -> Call[dict[str, Any]]:
     return Call("POST", "/uploads", _json, {"bytes": size})
 
@@ -118,7 +123,8 @@ def evaluate(job_id: str, split: str) -> Call[dict[str, Any]]:
 def make_video(job_id: str, path: Path | str, options: Query) -> tuple[Call[dict[str, Any]], bytes]:
     """The request for a video in the format that the file's name asks for, and its body."""
     body = json.dumps({"format": Path(path).suffix.lower().removeprefix("."), **options}).encode()
-    return Call("POST", f"/jobs/{job_id}/videos", _json, headers={"Content-Type": "application/json"}), body
+    headers = {"Content-Type": "application/json", "Content-Length": str(len(body))}
+    return Call("POST", f"/jobs/{job_id}/videos", _json, headers=headers), body
 
 
 def linked(task: dict[str, Any], name: str) -> Call[bytes]:
@@ -207,6 +213,8 @@ def _content(response: httpx2.Response) -> bytes:
 
 
 def _text(name: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value
     if name == "target":
         return ",".join(str(float(number)) for number in value)
     if name == "pose":

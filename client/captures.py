@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import time
 import zipfile
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
@@ -12,12 +11,12 @@ from typing import Any
 
 from client import calls
 from client.answers import ClientError, RefusedError
+from client.patience import Patience, passes
 
 CHUNK = 1 << 20
 # Bytes of one request: a proxy may keep a body back until it is complete, and loses it when the connection breaks.
 PART = 16 << 20
-# The connection broke, or another request that it belonged to is still open, or the service is busy.
-RETRIED = (400, 408, 409, 429, 502, 503, 504)
+BROKEN_BODY = 400  # a proxy's or the service's answer to a connection that broke within a body
 
 Observe = Callable[[int, int], None]
 Step = tuple[calls.Call[dict[str, Any]], Iterator[bytes] | None, float]
@@ -34,7 +33,8 @@ def packed(capture: Path | str) -> Iterator[Path]:
         raise ClientError(f"{source}: there is no such file or folder.")
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "capture.zip"
-        with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED) as archive:  # images are compressed already
+        # Images are compressed already, and a time before 1980, which zip cannot store, matters to nobody.
+        with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, strict_timestamps=False) as archive:
             for path in sorted(source.rglob("*")):
                 if path.is_file():
                     archive.write(path, path.relative_to(source))
@@ -56,26 +56,30 @@ def uploading(archive: Path, observe: Observe | None) -> Generator[Step, dict[st
     """The requests that bring an archive to the service, and at last the id of the upload.
 
     Each step is a request with its body and a pause before it; the answer is sent back, or a `ClientError` thrown in.
-    After an interruption the service is asked how far it came, for `calls.PATIENCE_S` without any progress.
+    After an interruption the service is asked how far it came, and the rest is sent, until nothing has arrived for
+    `PATIENCE_S` after the first failure.
     """
     size = archive.stat().st_size
     state = yield calls.begin_upload(size), None, 0.0
-    received, heard, broken = 0, time.monotonic(), False
+    received, broken, patience = 0, False, Patience()
     while broken or received < size:
-        end = min(size, received + PART)
+        end, asked = min(size, received + PART), broken
         try:
-            if broken:
+            if asked:
                 state = yield calls.upload_state(state["id"]), None, calls.RECONNECT_S
             else:
                 part = calls.send_part(state["id"], received, end, size)
                 state = yield part, chunks(archive, observe, received, end), 0.0
             broken = False
         except ClientError as error:
-            refused = isinstance(error, RefusedError) and error.status not in RETRIED
-            if refused or time.monotonic() - heard > calls.PATIENCE_S:
+            if not passes(error) and not (isinstance(error, RefusedError) and error.status == BROKEN_BODY):
                 raise
+            patience.failed(error)
             broken = True
         if state["received"] > received:
-            received, heard = state["received"], time.monotonic()
+            received = state["received"]
+            patience.succeeded()
+        elif asked:  # not after a part alone: most of it may have arrived
+            patience.check()
     upload_id: str = state["id"]
     return upload_id

@@ -28,6 +28,7 @@ from service.settings import Settings
 from service.telemetry import ServiceNumbers, Telemetry
 
 _SMALL_BODY = 64 * 1024
+_CAMERA_PATH = 4 * MB  # nerfstudio's file of 3 600 frames has 1.4 MB
 
 # A thread that wants to run Python waits for so long before it interrupts another; the default is 5 ms, and a short
 # request that meets two images at work would wait for it several times.
@@ -64,7 +65,8 @@ def create_app(settings: Settings) -> FastAPI:
     def limit(method: str, path: str) -> int:
         whole = method == "POST" and path in ("/jobs", "/plans", "/captures")
         part = method == "PUT" and path.startswith("/uploads/")
-        return settings.max_upload_mb * MB if whole or part else _SMALL_BODY
+        path_of_camera = method == "POST" and path.startswith("/jobs/") and path.endswith("/videos")
+        return settings.max_upload_mb * MB if whole or part else _CAMERA_PATH if path_of_camera else _SMALL_BODY
 
     app = Service(
         title="GrainGS",

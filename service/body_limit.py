@@ -24,12 +24,12 @@ class BodyLimit:
         request = Request(scope)
         most = self._limit(request.method, request.url.path)
         message = f"The body may have at most {most} bytes."
+        refusal = problem(request, 413, message, kind="too-large", headers=TooLarge.headers)
         declared = request.headers.get("content-length", "")
         if declared.isdigit() and int(declared) > most:
-            response = problem(request, 413, message, kind="too-large", headers=TooLarge.headers)
-            await response(scope, receive, send)
+            await refusal(scope, receive, send)
             return
-        received = 0
+        received, answering = 0, False
 
         async def counted() -> Message:
             nonlocal received
@@ -39,4 +39,13 @@ class BodyLimit:
                 raise TooLarge(message)
             return part
 
-        await self._app(scope, counted, send)
+        async def watched(message: Message) -> None:
+            """The refusal in place of what the application makes of a body that ends with an error."""
+            nonlocal answering
+            if answering or received <= most:
+                answering = True
+                await send(message)
+            elif message["type"] == "http.response.start":
+                await refusal(scope, receive, send)
+
+        await self._app(scope, counted, watched)

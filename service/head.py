@@ -6,6 +6,8 @@ import asyncio
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+ROUTED = ("route", "path_params")  # what routing adds to a scope, for the middleware outside
+
 
 class Head:
     """Middleware that runs GET for HEAD; the server leaves out the body. A stream ends after its headers."""
@@ -23,8 +25,11 @@ class Head:
             await started.wait()
             return {"type": "http.disconnect"}
 
+        inner = {**scope, "method": "GET"}
+
         async def watched(message: Message) -> None:
+            scope.update({name: inner[name] for name in ROUTED if name in inner})
             await send(message)
             started.set()
 
-        await self._app({**scope, "method": "GET"}, gone, watched)
+        await self._app(inner, gone, watched)

@@ -80,9 +80,12 @@ async def receive_capture(
     # Not only at the start of the service: files of a process that died may fill the disk that this upload needs.
     await to_thread.run_sync(discard_leftovers, uploads)
     name = uuid.uuid4().hex
-    archive, folder = uploads / f"{name}.part", uploads / name
+    archive, folder, begun = uploads / f"{name}.part", uploads / name, uploads / f"{name}.begun"
     try:
         if received is not None:
+            # The link has the time of the last byte that was received, which may be hours ago: without a younger file
+            # beside it another request would take it for abandoned.
+            await to_thread.run_sync(begun.touch)
             try:
                 os.link(received, archive)
             except FileNotFoundError as error:
@@ -104,6 +107,7 @@ async def receive_capture(
         yield Upload(folder, digest, config)
     finally:
         archive.unlink(missing_ok=True)
+        begun.unlink(missing_ok=True)
         await to_thread.run_sync(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 

@@ -5,6 +5,7 @@ from graings.config.optimization import EvaluationConfig as EvaluationConfig
 from graings.config.optimization import GuardConfig as GuardConfig
 from graings.config.optimization import RatesConfig as RatesConfig
 from graings.config.overrides import make_config as make_config
+from graings.config.overrides import merged as merged
 from graings.config.overrides import options as options
 from graings.config.overrides import restored as restored
 from graings.config.plan_options import Part as Part

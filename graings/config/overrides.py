@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -34,6 +35,14 @@ def make_config(preset: str = "standard", overrides: dict[str, Any] | None = Non
         raise ConfigError(f"{_problems(error)}. `graings options` lists every field with its bounds.") from error
 
 
+def merged(*overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Overrides as one, nested; of an option that several have, the last counts. Raises `ConfigError`."""
+    values: dict[str, Any] = {}
+    for each in overrides:
+        _merge(values, each)
+    return values
+
+
 def restored(kind: type[Stored], values: Any, source: Path) -> Stored:
     """Options read from a stored file. Raises `CheckpointError` naming the file and the invalid fields."""
     try:
@@ -49,7 +58,7 @@ def _problems(error: ValidationError) -> str:
     return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
 
 
-def _merge(into: dict[str, Any], values: dict[str, Any], depth: int = 0) -> None:
+def _merge(into: dict[str, Any], values: Mapping[str, Any], depth: int = 0) -> None:
     for key, value in values.items():
         head, _, rest = key.partition(".")
         if depth > MAX_DEPTH:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 
-from graings.config import make_config
+from graings.config import make_config, merged
 from graings.inspection.document import Inspection
 from service.access import CallerDep
 from service.context import ContextDep
@@ -35,5 +35,5 @@ async def inspect(
     overrides = {} if config is None else parse_config(config, "config")
     make_config(overrides=overrides)  # before the body is read
     async with sent_capture(request, context, caller, capture) as sent:
-        chosen = make_config(overrides={**overrides, **sent.config})
+        chosen = make_config(overrides=merged(overrides, sent.config))
         return await describe_capture(sent.folder, chosen.capture)

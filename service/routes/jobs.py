@@ -9,7 +9,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import HttpUrl
 
-from graings.config import PRESETS, make_config
+from graings.config import PRESETS, make_config, merged
 from jobs.job import ID_PATTERN, Job, JobSpec, JobState
 from service.access import CallerDep
 from service.context import ContextDep, JobId
@@ -59,7 +59,7 @@ async def submit(
     title = name or scene or "untitled"
     webhook_address = None if webhook is None else str(webhook)
     async with sent_capture(request, context, caller, capture, scene) as sent:
-        chosen = make_config(preset, {**overrides, **sent.config})
+        chosen = make_config(preset, merged(overrides, sent.config))
         await inspect_capture(sent.folder, chosen.capture)
         spec = JobSpec(title, sent.digest, chosen.model_dump(mode="json"), priority, caller.owner, webhook_address)
         folder = None if sent.stored else sent.folder

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 
-from graings.config import PRESETS, make_config
+from graings.config import PRESETS, make_config, merged
 from graings.plan.plan import Plan
 from service.access import CallerDep
 from service.context import ContextDep
@@ -36,4 +36,4 @@ async def plan(
     overrides = {} if config is None else parse_config(config, "config")
     make_config(preset, overrides)  # before the body is read
     async with sent_capture(request, context, caller, capture) as sent:
-        return await plan_capture(sent.folder, make_config(preset, {**overrides, **sent.config}))
+        return await plan_capture(sent.folder, make_config(preset, merged(overrides, sent.config)))

@@ -61,7 +61,7 @@ def begin_session(request: Request, response: Response, context: ContextDep, hea
 def end_session(response: Response, context: ContextDep, session: SessionDep) -> None:
     """Sign out: the session is refused from now on."""
     key = context.keys.find(session) if session else None
-    if key is None:
+    if key is None or key.kind != "session":  # a link or a key is not the caller's to revoke
         raise Unauthorized(session is not None)
     context.keys.revoke(key)
     response.delete_cookie(COOKIE)

@@ -71,9 +71,11 @@ def make_video(job_id: JobId, spec: VideoSpec, context: ContextDep, response: Re
     model = loaded.model
     shown = Shown(loaded.scene, model.units, model.views, model.background, model.digest)
     try:  # now, while the client waits: nothing but the rendering is left to the worker
-        frames_of(shown, spec.request, spec.path, spec.moves, spec.frames)
+        count = len(frames_of(shown, spec.request, spec.path, spec.moves, spec.frames))
     except (ValueError, CheckpointError) as error:
         raise BadRequest(f"{error}".rstrip(".") + ".") from error
+    if count > MAX_FRAMES:  # a path of nerfstudio's brings its own
+        raise BadRequest(f"path: has {count} frames; at most {MAX_FRAMES} are made.")
     return _accepted(context.tasks.submit(job_id, spec), response)
 
 

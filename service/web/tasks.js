@@ -59,7 +59,8 @@ async function text(task) {
   const name = task.spec.kind === "video" ? `Video (${task.spec.format})` : `Evaluation of ${task.spec.split}`;
   if (task.links.metrics) {
     const { splits } = await request(task.links.metrics);
-    return `${name}: ${splits[task.spec.split].psnr.toFixed(2)} dB `;
+    const measured = splits[task.spec.split]?.psnr; // training a job for longer removes what its earlier model had
+    return `${name}: ${measured == null ? "of an earlier model" : `${measured.toFixed(2)} dB`} `;
   }
   const { done, total } = task.progress ?? {};
   const state = pending(task) && total ? `${done} of ${total} frames` : task.state;

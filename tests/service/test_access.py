@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 from fastapi.routing import APIRoute
@@ -324,3 +325,17 @@ def test_a_service_that_others_can_reach_needs_a_key_to_start(tmp_path: Path, ho
     assert "graings keys create --scope admin" in refused.stderr
     assert not Settings(host=host).is_local
     assert all(Settings(host=local).is_local for local in ("127.0.0.1", "127.9.9.9", "::1", "localhost"))
+
+
+@pytest.mark.parametrize("kind", ["key", "link"])
+def test_signing_out_revokes_nothing_but_a_session(
+    closed: TestClient, keys: Keys, capture: Path, kind: Literal["key", "link"]
+) -> None:
+    """Whoever was given a link must not be able to take it from the others who have it."""
+    owner, _ = keys.create("me", Scope.TRAIN)
+    job = add_job(closed, capture, owner.id)
+    link: dict[str, Any] = {"parent": owner.id, "job": job} if kind == "link" else {}
+    _, secret = keys.create("theirs", Scope.VIEW if link else Scope.TRAIN, kind, **link)
+    problem(closed.delete("/session", headers={"Cookie": f"graings_session={secret}"}), 401)
+    assert closed.get(f"/jobs/{job}", headers=bearer(secret)).status_code == (200 if link else 404)
+    assert closed.post("/session", headers=bearer(secret)).status_code == 204

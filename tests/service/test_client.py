@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import pytest
 import uvicorn
 
 from client import AsyncClient, Client, ClientError, Event, RefusedError
+from client.captures import packed
 from jobs.progress import ProgressReport, ProgressWriter
 from jobs.store import JobFolder
 from service.app import create_app
@@ -73,6 +75,15 @@ def test_a_folder_is_packed_sent_and_queued(
     remote.delete(job.id)
     with pytest.raises(RefusedError, match="There is no job"):
         remote.job(job.id)
+
+
+def test_a_capture_whose_files_have_no_time_is_packed(tmp_path: Path) -> None:
+    """Archives and containers that are built to have the same bytes give their files the time 0; zip begins in 1980."""
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "a.png").write_bytes(b"image")
+    os.utime(tmp_path / "old" / "a.png", (0, 0))
+    with packed(tmp_path / "old") as path, zipfile.ZipFile(path) as archive:
+        assert archive.read("a.png") == b"image"
 
 
 def finish_later(folder: JobFolder, remote: Client, job: str, delay_s: float) -> threading.Thread:

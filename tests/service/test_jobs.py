@@ -49,10 +49,13 @@ def test_a_submitted_capture_becomes_a_queued_job(client: TestClient, archive: b
 
 
 def test_a_form_with_a_file_and_options_does_the_same(client: TestClient, archive: bytes) -> None:
-    form = {"config": json.dumps({"iterations": 70, "preset": "long"})}
-    answer = client.post("/jobs", params={"config": '{"iterations": 60}'}, files={"capture": archive}, data=form)
+    form = {"config": json.dumps({"iterations": 70, "preset": "long", "loss": {"squared": 3.0}})}
+    query = {"config": '{"iterations": 60, "loss": {"ssim": 0.1, "squared": 2.0}}'}
+    answer = client.post("/jobs", params=query, files={"capture": archive}, data=form)
     assert answer.status_code == 202, answer.text
     assert (answer.json()["config"]["iterations"], answer.json()["config"]["preset"]) == (70, "long")
+    loss = answer.json()["config"]["loss"]
+    assert (loss["ssim"], loss["squared"]) == (0.1, 3.0)  # a section in both is joined, not replaced
 
 
 def test_a_lone_transforms_file_with_its_points_becomes_a_job(client: TestClient, tmp_path: Path) -> None:

@@ -115,3 +115,21 @@ def test_a_service_stops_with_open_streams_and_their_clients_come_back(tmp_path:
     assert not thread.is_alive()
     assert [event.data["iteration"] for event in seen if event.kind == "progress"] == [7]
     assert seen[-1].kind == "end"
+
+
+def test_a_method_that_a_client_makes_up_is_counted_with_the_others_of_its_kind(client: TestClient) -> None:
+    """Each would be a histogram that stays in memory, and nobody needs a key to send one."""
+    for number in range(20):
+        assert client.request(f"M{number}", "/healthz").status_code == 405
+    found = numbers(client)
+    assert sum(count for name, count in found.items() if name.startswith("other ")) == 20
+    assert not any(name.startswith("M") for name in found)
+
+
+def test_head_is_counted_and_logged_as_its_route(
+    client: TestClient, job: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO", "service.requests"):
+        assert client.head(f"/jobs/{job}").status_code == 200
+    assert [vars(record)["job"] for record in caplog.records if record.name == "service.requests"] == [job]
+    assert numbers(client)["HEAD /jobs/{job_id} 200"] == 1

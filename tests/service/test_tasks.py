@@ -15,6 +15,7 @@ from graings.export.video_file import decoded, video_file
 from graings.export.video_parts import FRAMES
 from jobs.queue import JobQueue
 from jobs.store import JobFolder
+from jobs.task import MAX_FRAMES
 from jobs.task_list import MAX_TASKS
 from tests.jobs.test_worker import children, until, working
 from tests.service.test_jobs import problem
@@ -210,3 +211,26 @@ def test_a_task_that_fails_names_no_folder_of_the_service(client: TestClient, jo
     assert evaluation["state"] == "failed"
     assert "transforms_test.json" in evaluation["error"]
     assert str(jobs.store.root) not in evaluation["error"]
+
+
+def test_a_long_path_of_nerfstudio_is_taken_and_one_that_is_too_long_refused(client: TestClient, model: str) -> None:
+    """Ten seconds are 90 kB of numbers."""
+    frame = {"camera_to_world": POSE, "fov": 50.123456789, "aspect": 1.777777777777}
+    path = nerfstudio(camera_path=[frame] * 1_000)
+    assert len(json.dumps(path)) > 100_000
+    task = ask(client, f"/jobs/{model}/videos", json={"path": path})
+    assert len(task["spec"]["path"]["camera_path"]) == 1_000
+    many = nerfstudio(camera_path=[frame] * (MAX_FRAMES + 1))
+    assert "3601 frames" in problem(client.post(f"/jobs/{model}/videos", json={"path": many}), 422)["detail"]
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_a_body_that_is_too_large_is_called_so_by_a_route_of_json_too(
+    client: TestClient, model: str, chunked: bool
+) -> None:
+    """Whether or not the request says its length: the framework calls a body that ends with an error unreadable."""
+    body = b'{"seconds": 2' + b" " * 4_000_000 + b"}"
+    content = iter((body[:2_500_000], body[2_500_000:])) if chunked else body
+    headers = {"Content-Type": "application/json"}
+    refused = client.post(f"/jobs/{model}/videos", content=content, headers=headers)
+    assert problem(refused, 413)["type"].endswith("too-large")
