@@ -2,7 +2,7 @@
 
 Frames, camera poses, undistorted images and first points, in the single-file layout of nerfstudio. What is done so far
 lies in `.footage` of the capture's folder: a call that was interrupted continues there, and one that asks for other
-frames begins again.
+frames begins again. Nothing else in that folder is replaced or removed.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from graings.document import read_document
 from graings.errors import CaptureError
 from graings.footage.frame_document import FootageFrames, FrameRequest
 from graings.footage.photos import convert_photographs, photographs
+from graings.footage.placement import check_free, is_finished, place
 from graings.footage.poses import reconstruct
 from graings.footage.registration import MIN_TRACK, check_usable, measure, nothing_registered, upright
 from graings.footage.report import REPORT_FILE, FootageReport
@@ -37,6 +38,10 @@ WORKSPACE: Final = ".footage"
 LOCK_FILE: Final = ".lock"
 TRANSFORMS: Final = "transforms.json"
 POINTS: Final = "points.ply"
+IMAGES: Final = "images"
+
+# In the order in which they are put into the capture's folder: with the last one the capture is complete.
+CAPTURE_FILES: Final = (IMAGES, POINTS, REPORT_FILE, TRANSFORMS)
 
 Observe = Callable[[str, int, int], None]
 
@@ -56,43 +61,72 @@ def make_capture(
     Of a video at most `frames` frames are taken, of a folder all photographs, or those of its only folder; images have
     no side above `max_side` px. A `static` capture has no times. `observe` is called with the phase, what is done of it
     and its total. Raises `CaptureError` where the source cannot be read, where its frames do not fit together, and for
-    a `target` that holds a capture, was begun with another source, or is being written by another process.
+    a `target` that holds a capture or files in the places of one, that was begun with another source, or that is being
+    written by another process.
     """
     if not source.exists():
         raise CaptureError("does not exist", file=source, remedy="Give a video or a folder of photographs.")
     if source.is_dir() and not photographs(source):
         source = find_footage(source) or source  # as the service does: the folder of a folder, or of a lone video
-    if (target / TRANSFORMS).exists():
-        raise CaptureError("holds a capture already", file=target, remedy="Choose another folder.")
     workspace = target / WORKSPACE
+    made = workspace / ("static" if static else "moving")  # two, as a finished one has times or has none
+    _check_target(source, target, made)
+    seconds: dict[str, float] = {}
+    observe = _timed(observe, seconds)
     workspace.mkdir(parents=True, exist_ok=True)
     with _sole(workspace):
-        report = _make(source, target, _request(source, frames, max_side), static, threads, observe)
+        taken = _frames(source, workspace, _request(source, frames, max_side), observe)
+        check_free(made, target, CAPTURE_FILES)  # again, as other frames begin without what was finished
+        if not is_finished(made, CAPTURE_FILES):
+            _make(source, workspace, made, taken, static, threads, observe, seconds)
+        place(made, target, CAPTURE_FILES)
         shutil.rmtree(workspace)
-    return report
+    return read_document(target / REPORT_FILE, FootageReport, "Make the capture again.")
+
+
+def _check_target(source: Path, target: Path, made: Path) -> None:
+    """Raise `CaptureError` where the capture would be written over files, or among those it is made of."""
+    if target.exists() and not target.is_dir():
+        raise CaptureError("is a file, not a folder", file=target, remedy="Choose another folder.")
+    if (target / TRANSFORMS).exists():
+        raise CaptureError("holds a capture already", file=target, remedy="Choose another folder.")
+    workspace, there = target / WORKSPACE, source.resolve()
+    if workspace.exists() and any(workspace.iterdir()) and not (workspace / LOCK_FILE).exists():
+        problem = "is not the workspace of an earlier call"
+        raise CaptureError(problem, file=workspace, remedy="Choose another folder for the capture, or move it away.")
+    written = [path.resolve() for path in (target / IMAGES, workspace)]
+    if there == target.resolve() or any(there.is_relative_to(path) for path in written):
+        problem = f"lies where the capture {target} would be written"
+        raise CaptureError(problem, file=source, remedy="Choose another folder for the capture.")
+    check_free(made, target, CAPTURE_FILES)
 
 
 def _make(
-    source: Path, target: Path, request: FrameRequest, static: bool, threads: int, observe: Observe
-) -> FootageReport:
-    workspace = target / WORKSPACE
-    seconds: dict[str, float] = {}
-    observe_timed = _timed(observe, seconds)
-
-    taken = _frames(source, workspace, request, observe_timed)
+    source: Path,
+    workspace: Path,
+    made: Path,
+    taken: FootageFrames,
+    static: bool,
+    threads: int,
+    observe: Observe,
+    seconds: dict[str, float],
+) -> None:
+    """Write the files of the capture to the folder `made`; `seconds` of each phase are those of `observe`."""
     names = [frame.name for frame in taken.frames]
-    model = reconstruct(workspace / "frames", names, workspace, threads, observe_timed)
+    model = reconstruct(workspace / "frames", names, workspace, threads, observe)
     if model is None:
         raise nothing_registered(len(names), source)
     found = measure(model)
     check_usable(found, len(names), source)
-    observe_timed("undistortion", 0, 1)
+    observe("undistortion", 0, 1)
     times = {} if static else {frame.name: frame.time for frame in taken.frames}
-    _write_capture(model, workspace, target, times)
-    observe_timed("undistortion", 1, 1)
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir()
+    transforms = _write_images_and_points(model, workspace, made, times)
+    observe("undistortion", 1, 1)
     registered = [times[name] for name in found.names if name in times]
     report = FootageReport(
-        source=request.source,
+        source=taken.request.source,
         seen=taken.seen,
         taken=len(names),
         registered=len(found.names),
@@ -105,11 +139,11 @@ def _make(
         path_over_depth=found.path_over_depth,
         duration=max(registered) - min(registered) if registered else 0.0,
         camera=found.camera,
-        notes=taken.notes,
+        notes=(*taken.notes, *found.notes()),
         seconds=seconds,
     )
-    write_document(target / REPORT_FILE, report)
-    return report
+    write_document(made / REPORT_FILE, report)
+    write_json(made / TRANSFORMS, transforms)
 
 
 def _timed(observe: Observe, seconds: dict[str, float]) -> Observe:
@@ -178,8 +212,10 @@ def _sole(workspace: Path) -> Iterator[None]:
         yield
 
 
-def _write_capture(model: pycolmap.Reconstruction, workspace: Path, target: Path, times: dict[str, float]) -> None:
-    """Undistorted images, cameras and points. `transforms.json` comes last: with it the capture is complete."""
+def _write_images_and_points(
+    model: pycolmap.Reconstruction, workspace: Path, made: Path, times: dict[str, float]
+) -> dict[str, Any]:
+    """Write undistorted images and points to the folder `made`; returns the transforms file with their cameras."""
     pycolmap = import_pycolmap()
     rotation = pycolmap.Rotation3d(upright(model))
     model.transform(pycolmap.Sim3d(1.0, rotation, np.zeros(3)))
@@ -192,18 +228,14 @@ def _write_capture(model: pycolmap.Reconstruction, workspace: Path, target: Path
     for key, point in list(pinhole.points3D.items()):
         if point.track.length() < MIN_TRACK:
             pinhole.delete_point3D(key)
-    pinhole.export_PLY(target / POINTS)
-    shutil.rmtree(target / "images", ignore_errors=True)
-    shutil.move(undistorted / "images", target / "images")
+    pinhole.export_PLY(made / POINTS)
+    (undistorted / "images").rename(made / IMAGES)
     images = sorted((pinhole.image(key) for key in pinhole.reg_image_ids()), key=lambda image: image.name)
-    write_json(
-        target / TRANSFORMS,
-        {
-            "camera_model": "PINHOLE",
-            "ply_file_path": POINTS,
-            "frames": [_frame(image, pinhole.camera(image.camera_id), times.get(image.name)) for image in images],
-        },
-    )
+    return {
+        "camera_model": "PINHOLE",
+        "ply_file_path": POINTS,
+        "frames": [_frame(image, pinhole.camera(image.camera_id), times.get(image.name)) for image in images],
+    }
 
 
 def _frame(image: pycolmap.Image, camera: pycolmap.Camera, moment: float | None) -> dict[str, Any]:
@@ -212,7 +244,7 @@ def _frame(image: pycolmap.Image, camera: pycolmap.Camera, moment: float | None)
     world_from_camera[:3] = image.cam_from_world().inverse().matrix()
     world_from_camera[:, 1:3] *= -1  # OpenCV's y down, z forward to OpenGL's y up, z back
     return {
-        "file_path": f"images/{image.name}",
+        "file_path": f"{IMAGES}/{image.name}",
         "fl_x": camera.focal_length_x,
         "fl_y": camera.focal_length_y,
         "cx": camera.principal_point_x,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -22,8 +23,15 @@ PNG_LEVEL: Final = 1
 
 
 def photographs(folder: Path) -> list[Path]:
-    """The images of `folder`, in order of their names."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    """The images of `folder` that are not hidden, in order of their names, in which digits count as numbers."""
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return sorted((path for path in visible if path.suffix.lower() in SUFFIXES and path.is_file()), key=_by_number)
+
+
+def _by_number(path: Path) -> tuple[list[str | int], str]:
+    """A key that sorts frame2 before frame10."""
+    parts = re.split(r"([0-9]+)", path.name.casefold())
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], path.name
 
 
 def convert_photographs(
@@ -53,6 +61,12 @@ def convert_photographs(
         return tuple(frames), ("the photographs have no times of their own: their order by name is taken as time",)
     frames = [frame.model_copy(update={"time": t - min(known)}) for frame, t in zip(frames, known, strict=True)]
     return tuple(sorted(frames, key=lambda frame: frame.time)), ("times are those of the EXIF tags",)
+
+
+def image_size(image: Path) -> tuple[int, int]:
+    """Width and height in px of a readable image as it is stored."""
+    spec = oiio.ImageBuf(str(image)).spec()
+    return spec.width, spec.height
 
 
 def _read(photo: Path, max_side: int) -> tuple[oiio.ImageBuf, float | None]:

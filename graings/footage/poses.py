@@ -1,7 +1,8 @@
 """Camera poses of frames by structure from motion: pycolmap's SIFT, matching of near frames and loops, global mapping.
 
-One camera with one radial coefficient took all frames. Features and matches lie in a database in the workspace, so an
-interrupted call continues. Global mapping solves all poses at once: incremental mapping took as long or longer on the
+Frames of one size share a camera with one radial coefficient. Photographs may have several sizes, as those held upright
+and across, and each has a camera of its own. Features and matches lie in a database in the workspace, so an interrupted
+call continues. Global mapping solves all poses at once: incremental mapping took as long or longer on the
 clips tried, and broke some of them into pieces.
 """
 
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from graings.colmap import import_pycolmap
 from graings.errors import CaptureError
+from graings.footage.photos import image_size
 
 if TYPE_CHECKING:
     import pycolmap
@@ -26,6 +28,8 @@ CAMERA_MODEL: Final = "SIMPLE_RADIAL"
 OVERLAP: Final = 5
 FAR: Final = (8, 16, 32)
 LOOP_PERIOD: Final = 8
+
+NO_CAMERA: Final = -1  # pycolmap then makes one
 
 FEATURES_AT_ONCE: Final = 8
 PAIRS_AT_ONCE: Final = 64
@@ -76,15 +80,23 @@ def _extract(database: Path, images: Path, names: Sequence[str], threads: int, o
     options.sift.first_octave = 0  # not doubled first: a third of the time, and as many frames registered
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = CAMERA_MODEL
+    sizes = {name: image_size(images / name) for name in names}
     done = 0
-    for chunk in _chunks(names, FEATURES_AT_ONCE):
-        if database.exists():
-            reader.existing_camera_id = 1
-        pycolmap.extract_features(
-            database, images, list(chunk), pycolmap.CameraMode.SINGLE, reader, options, pycolmap.Device.cpu
-        )
-        done += len(chunk)
-        observe("features", done, len(names))
+    for size in sorted(set(sizes.values())):
+        for chunk in _chunks([name for name in names if sizes[name] == size], FEATURES_AT_ONCE):
+            reader.existing_camera_id = _cameras(database).get(size, NO_CAMERA)
+            pycolmap.extract_features(
+                database, images, list(chunk), pycolmap.CameraMode.SINGLE, reader, options, pycolmap.Device.cpu
+            )
+            done += len(chunk)
+            observe("features", done, len(names))
+
+
+def _cameras(database: Path) -> dict[tuple[int, int], int]:
+    """The camera of each size of images that the database has."""
+    pycolmap = import_pycolmap()
+    with pycolmap.Database.open(database) as content:
+        return {(camera.width, camera.height): camera.camera_id for camera in content.read_all_cameras()}
 
 
 def _match(database: Path, names: Sequence[str], listing: Path, threads: int, observe: Observe) -> None:

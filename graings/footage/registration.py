@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -33,7 +34,7 @@ PARALLAX_REMEDY: Final = "Walk sideways around the subject while recording, so t
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Facts of a reconstruction; angles in degrees."""
+    """Facts of a reconstruction; angles in degrees. `camera` is that of most images, `cameras` their number."""
 
     names: tuple[str, ...]
     points: int
@@ -42,6 +43,13 @@ class Registration:
     parallax: float
     path_over_depth: float
     camera: FootageCamera
+    cameras: int
+
+    def notes(self) -> tuple[str, ...]:
+        """A note on frames of several sizes."""
+        if self.cameras == 1:
+            return ()
+        return (f"the frames have {self.cameras} sizes, each with a camera of its own; the one shown is of most",)
 
 
 def measure(model: pycolmap.Reconstruction) -> Registration:
@@ -58,7 +66,8 @@ def measure(model: pycolmap.Reconstruction) -> Registration:
         angles.append(math.degrees(math.acos(np.clip(cosines.min(), -1, 1))))
         depths.append(float(np.median(lengths)))
     path = sum(float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(centers.values()))
-    camera = model.camera(images[0].camera_id)
+    used = Counter(image.camera_id for image in images)
+    camera = model.camera(used.most_common(1)[0][0])
     return Registration(
         names=tuple(image.name for image in images),
         points=len(points),
@@ -73,6 +82,7 @@ def measure(model: pycolmap.Reconstruction) -> Registration:
             field_of_view=math.degrees(2 * math.atan(camera.width / 2 / camera.focal_length)),
             distortion=float(camera.params[-1]),
         ),
+        cameras=len(used),
     )
 
 

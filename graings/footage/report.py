@@ -38,7 +38,7 @@ class FootageReport(Document):
     parallax: float = Field(ge=0, description="Median over the points of the widest angle between their rays, degrees.")
     path_over_depth: float = Field(ge=0, description="Length of the camera's path over the median depth of the points.")
     duration: float = Field(ge=0, description="Seconds between the first and the last image; 0 for a static capture.")
-    camera: FootageCamera = Field(description="The camera of all frames.")
+    camera: FootageCamera = Field(description="The camera of all frames, or of most where they have several sizes.")
     notes: tuple[str, ...] = Field((), description="What was assumed, in plain words.")
     seconds: dict[str, float] = Field(description="Wall-clock seconds per phase.")
 

@@ -17,8 +17,9 @@ def find_footage(folder: Path) -> Path | None:
     """The only video of `folder` and its folders, or the folder with all its photographs; None where there is more.
 
     A file of another kind, such as a transforms file or a COLMAP model, means that the folder is meant as a capture.
+    Hidden files and folders do not count.
     """
-    files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    files = [path for path in folder.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder))]
     suffixes = {path.suffix.lower() for path in files}
     if len(files) == 1 and suffixes <= VIDEO_SUFFIXES:
         return files[0]
@@ -26,6 +27,10 @@ def find_footage(folder: Path) -> Path | None:
     if len(files) >= MIN_PHOTOGRAPHS and len(folders) == 1 and suffixes <= PHOTO_SUFFIXES:
         return folders.pop()
     return None
+
+
+def _is_hidden(path: Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)
 
 
 def video_suffix(file: Path) -> str | None:

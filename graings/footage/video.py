@@ -41,8 +41,8 @@ def extract_frames(
     """Write at most `count` frames of `video` to the folder `target` as PNG, no side above `max_side` px.
 
     Times are the presentation times of the frames, so a variable frame rate is respected; the rotation that phones
-    store is applied. Returns how many frames the video has, and those written. Raises `CaptureError` for what is no
-    video, for HDR video, and without the package PyAV.
+    store is applied, and pixels that are not square become square. Returns how many frames the video has, and those
+    written. Raises `CaptureError` for what is no video, for HDR video, and without the package PyAV.
     """
     try:
         import av  # optional extra [video]
@@ -72,6 +72,7 @@ def _extract(
     duration = _duration(container, stream)
     if duration is None:
         raise CaptureError("does not say how long it is", file=video, remedy="Convert it to MP4 (H.264).")
+    aspect = float(stream.sample_aspect_ratio or 1)
     written: list[FootageFrame] = []
     best: _Candidate | None = None
     interval, seen, start = 0, 0, 0.0
@@ -85,7 +86,7 @@ def _extract(
         time = frame.time - start
         current = min(int(time / duration * count + ROUNDING), count - 1)
         if best is not None and current != interval:
-            written.append(_write(best, target, len(written), max_side))
+            written.append(_write(best, target, len(written), max_side, aspect))
             observe(current, count)
             best = None
         interval = current
@@ -93,7 +94,7 @@ def _extract(
         if best is None or value > best.sharpness:
             best = _Candidate(frame, time, value)
     if best is not None:
-        written.append(_write(best, target, len(written), max_side))
+        written.append(_write(best, target, len(written), max_side, aspect))
     return seen, tuple(written)
 
 
@@ -118,10 +119,12 @@ def _luma(frame: Any) -> NDArray[np.uint8]:
     return luma
 
 
-def _write(candidate: _Candidate, target: Path, index: int, max_side: int) -> FootageFrame:
+def _write(candidate: _Candidate, target: Path, index: int, max_side: int, aspect: float) -> FootageFrame:
+    """Write the frame with square pixels; those of the video are `aspect` times as wide as they are high."""
     frame = candidate.frame
-    scale = min(1.0, max_side / max(frame.width, frame.height))
-    width, height = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
+    shown = frame.width * aspect
+    scale = min(1.0, max_side / max(shown, frame.height))
+    width, height = max(1, round(shown * scale)), max(1, round(frame.height * scale))
     pixels = frame.reformat(width=width, height=height, format="rgb24", interpolation="AREA").to_ndarray()
     upright = np.rot90(pixels, k=round(frame.rotation / 90) % 4)
     name = f"{index:05d}.png"

@@ -7,9 +7,11 @@ import struct
 import sys
 from pathlib import Path
 
+import pycolmap
 import pytest
 
 from graings.capture.load import load_capture
+from graings.capture.readers.colmap_camera import CAMERA_MODELS, PANORAMIC_MODELS
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
 from tests.capture.captures import Break, cut, pixels, write_colmap, write_image
@@ -116,6 +118,19 @@ def test_broken_text_model_is_refused_with_its_reason(tmp_path: Path, name: str)
     breaks(folder)
     with pytest.raises(CaptureError, match=f"^{message}"):
         load_capture(folder)
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+def test_panoramas_are_refused_with_the_way_to_cut_them(tmp_path: Path, text: bool) -> None:
+    where = rf"sparse/0/cameras\.{'txt, line 4' if text else 'bin, camera 1'}"
+    write_colmap(tmp_path, model="EQUIRECTANGULAR", params=(64.0, 32.0), size=(64, 32), text=text)
+    with pytest.raises(CaptureError, match=rf"^{where}: .*EQUIRECTANGULAR show all directions.*perspective views"):
+        load_capture(tmp_path)
+
+
+def test_every_model_of_colmap_is_read_or_explained() -> None:
+    known = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    assert {number: name for number, (name, _, _) in CAMERA_MODELS.items()} | PANORAMIC_MODELS == known
 
 
 def test_lens_that_cannot_be_undistorted_is_refused(tmp_path: Path) -> None:

@@ -18,12 +18,9 @@ from graings.errors import CaptureError
 from tests.capture.captures import (
     FOV,
     entry,
-    opengl,
     orbit,
-    pixels,
     write_colmap,
     write_dnerf,
-    write_image,
     write_single,
     write_transforms,
 )
@@ -117,6 +114,17 @@ def test_missing_pictures_of_a_colmap_model_are_skipped_too(tmp_path: Path) -> N
     (folder / "images/frame_0030.png").unlink()
     assert sum(count(folder)) == 19
     assert "1 of 20 images of sparse/0 (5%) are missing" in note(folder, "missing")
+
+
+@pytest.mark.parametrize("listed", [(3,), (3, 5), (0, 3, 5, 7)])
+def test_a_missing_picture_may_be_in_the_test_list_of_a_colmap_model(tmp_path: Path, listed: tuple[int, ...]) -> None:
+    folder = write_colmap(tmp_path, count=10)
+    (folder / "sparse/0/test.txt").write_text("".join(f"frame_{10 * index:04d}.png\n" for index in listed))
+    (folder / "images/frame_0030.png").unlink()
+    capture = load_capture(folder)
+    assert {frame.name for frame in capture.test} == {f"images/frame_{10 * i:04d}.png" for i in listed if i != 3}
+    assert sum(count(folder)) == 9
+    assert "1 of 10 images" in note(folder, "are missing and left out")
 
 
 def test_a_split_that_was_never_rendered_is_left_out_and_images_are_held_out_instead(tmp_path: Path) -> None:
@@ -275,44 +283,3 @@ def test_a_format_that_is_not_read_is_named_with_the_way_in(tmp_path: Path, name
         with pytest.raises(CaptureError, match=f"holds .*{FOREIGN[name]}, which is not read") as caught:
             load_capture(folder)
         assert len(caught.value.remedy) > 20
-
-
-def rig(folder: Path, cameras: int = 9, times: int = 3, place: str = "{camera}") -> Path:
-    """A COLMAP model of one instant and a folder of frames for each camera."""
-    write_colmap(folder, count=cameras)
-    for camera in range(cameras):
-        for time in range(times):
-            name = place.format(camera=f"frame_{10 * camera:04d}")
-            write_image(folder / name / f"f{5 + time:03d}.png", pixels(20, 32, 3, seed=100 * camera + time))
-    return folder
-
-
-@pytest.mark.parametrize("place", ["{camera}", "images/{camera}"])
-def test_a_rig_of_still_cameras_is_read_when_asked(tmp_path: Path, place: str) -> None:
-    folder = rig(tmp_path, place=place)
-    assert "27 frames of 9 cameras" in note(folder, "capture.rig=true")
-    capture = load_capture(folder, CaptureConfig(rig=True))
-    assert (len(capture.train), len(capture.val), len(capture.test)) == (18, 3, 6)  # whole cameras are held out
-    assert capture.times.tolist() == [0.0, 0.5, 1.0]
-    for _, frame in capture:
-        camera = int(frame.name.split("frame_")[1][:4]) // 10
-        expected = orbit(camera, 9).world_to_camera
-        np.testing.assert_allclose(capture.units.camera_back(frame.camera), expected, atol=1e-12)
-    train, test = ({frame.name[:-9] for frame in capture.split(split)} for split in ("train", "test"))
-    assert not train & test
-
-
-def test_a_rig_without_the_frames_of_a_camera_names_it(tmp_path: Path) -> None:
-    shutil.rmtree(rig(tmp_path) / "frame_0030")
-    with pytest.raises(CaptureError, match=r"the camera frame_0030\.png has no folder of frames"):
-        load_capture(tmp_path, CaptureConfig(rig=True))
-
-
-def test_a_rig_of_a_transforms_file_is_read_too(tmp_path: Path) -> None:
-    folder = write_single(tmp_path, 9)
-    for camera in range(9):
-        for time in range(2):
-            write_image(folder / f"frame_{camera:05d}/{time}.png", pixels(40, 64, 3, seed=10 * camera + time))
-    assert count(folder, rig=True) == (12, 2, 4)
-    poses = {int(frame.name[6:11]): frame.camera for _, frame in load_capture(folder, CaptureConfig(rig=True))}
-    assert opengl(poses[0]) != opengl(poses[1])

@@ -77,6 +77,11 @@ def test_cameras_times_points_and_splits_are_those_of_the_files(tmp_path: Path) 
     np.testing.assert_allclose(points, [[0, 0, 0.5], [0.25, 0, 0]], atol=1e-7)
 
 
+def test_a_rig_is_refused_as_its_frames_are_listed_already(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match=r"^dataset\.json, capture\.rig: lists every frame itself.*rig=false"):
+        load_capture(write_nerfies(tmp_path), CaptureConfig(rig=True))
+
+
 @pytest.mark.parametrize(("max_side", "scale"), [(None, "1x"), (40, "1x"), (24, "2x"), (16, "2x"), (400, "1x")])
 def test_the_smallest_pictures_that_suffice_are_read(tmp_path: Path, max_side: int | None, scale: str) -> None:
     capture = load_capture(write_nerfies(tmp_path), CaptureConfig(max_side=max_side))
@@ -94,8 +99,15 @@ def test_covisible_masks_are_those_of_held_out_views(tmp_path: Path) -> None:
         assert valid.tolist() == [[row >= 4] * 24 for row in range(16)]
 
 
-def test_a_distorted_lens_is_undistorted_as_opencv_orders_its_coefficients(tmp_path: Path) -> None:
-    folder = write_nerfies(tmp_path, radial_distortion=[0.1, 0.01, 0.002], tangential_distortion=[0.003, -0.002])
+@pytest.mark.parametrize("keys", [("tangential_distortion",), ("tangential",), ("tangential", "tangential_distortion")])
+def test_a_distorted_lens_is_undistorted_as_opencv_orders_its_coefficients(
+    tmp_path: Path, keys: tuple[str, ...]
+) -> None:
+    folder = write_nerfies(tmp_path, radial_distortion=[0.1, 0.01, 0.002])
+    for path in (folder / "camera").iterdir():
+        entry = json.loads(path.read_text())
+        del entry["tangential_distortion"]
+        path.write_text(json.dumps({**entry, **{key: [0.003, -0.002] for key in keys}}))
     lens = load_capture(folder).train[0].lens
     assert lens is not None
     assert lens.model == "FULL_OPENCV"
@@ -126,6 +138,17 @@ def camera(**keys: Any) -> Callable[[Path], Any]:
 
 def array(values: Any) -> Callable[[Path], Any]:
     return lambda folder: np.save(folder / "points.npy", values)
+
+
+@pytest.mark.parametrize("key", ["tangential", "tangential_distortion"])
+def test_a_distortion_that_is_no_pair_is_refused_under_either_name(tmp_path: Path, key: str) -> None:
+    folder = write_nerfies(tmp_path)
+    for path in (folder / "camera").iterdir():
+        entry = json.loads(path.read_text())
+        del entry["tangential_distortion"]
+        path.write_text(json.dumps({**entry, key: [0.003]}))
+    with pytest.raises(CaptureError, match=rf"^camera/0_00000\.json, {key}"):
+        load_capture(folder)
 
 
 MIRROR = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]

@@ -70,6 +70,21 @@ def test_poses_belong_to_the_folders_of_a_rig(tmp_path: Path, place: str) -> Non
         check_camera(frame.camera, camera, capture.units.camera_back(frame.camera))
 
 
+def test_with_the_option_the_folders_of_a_rig_are_read_beside_the_calibrated_pictures(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    write_rig(tmp_path)
+    assert sum(len(load_capture(tmp_path).split(split)) for split in ("train", "val", "test")) == 10
+    capture = load_capture(tmp_path, CaptureConfig(rig=True))
+    assert (len(capture.train), len(capture.val), len(capture.test)) == (21, 3, 6)
+    assert capture.times.tolist() == [0.0, 0.5, 1.0]
+
+
+def test_the_option_for_a_rig_without_folders_of_frames_is_refused(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    with pytest.raises(CaptureError, match=r"^poses_bounds\.npy: gives 10 poses.* and no 10 folders of frames"):
+        load_capture(tmp_path, CaptureConfig(rig=True))
+
+
 def test_videos_are_refused_with_the_command_that_extracts_their_frames(tmp_path: Path) -> None:
     write_poses(tmp_path)
     for camera in range(10):

@@ -48,9 +48,11 @@ def encode(
     times: Iterable[float] | None = None,
     clockwise: bool = False,
     transfer: int | None = None,
+    pixel_aspect: Fraction | None = None,
 ) -> Path:
     """Write `images` as H.264; `times` in seconds (default: FPS a second), `clockwise` marks the
-    frames as to be turned by 90 degrees for display, as phones do; `transfer` is the code of the transfer function."""
+    frames as to be turned by 90 degrees for display, as phones do; `transfer` is the code of the transfer function;
+    pixels are `pixel_aspect` times as wide as high."""
     import av
 
     with av.open(str(path), "w") as container:
@@ -60,6 +62,8 @@ def encode(
         stream.codec_context.time_base = Fraction(1, 1000)
         if transfer is not None:
             stream.codec_context.color_trc = transfer
+        if pixel_aspect is not None:
+            stream.codec_context.sample_aspect_ratio = pixel_aspect
         moments = iter(times) if times is not None else (index / FPS for index in range(1_000_000))
         for image, moment in zip(images, moments, strict=False):
             if not stream.codec_context.is_open:

@@ -34,6 +34,29 @@ def test_photographs_without_times_are_numbered_in_order_of_their_names(tmp_path
     assert "order by name" in notes[0]
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"frame{index}.png" for index in range(1, 13)],
+        [f"Frame{index}.png" if index % 2 else f"frame{index}.png" for index in range(1, 13)],
+        ["2.png", "010.png", "11.png", "a1b9.png", "a1b10.png", "a2b1.png", "b.png", "b.webp"],
+        ["IMG_9 (2).png", "IMG_10 (1).png", "IMG_10 (10).png"],
+        ["9.jpg", "99999999999999999999999999999999999.jpg"],
+    ],
+)
+def test_digits_of_a_name_count_as_a_number(tmp_path: Path, names: list[str]) -> None:
+    for name in sorted(names, key=hash):
+        (tmp_path / name).write_bytes(b"")
+    assert [path.name for path in photographs(tmp_path)] == names
+
+
+def test_hidden_files_are_no_photographs(tmp_path: Path) -> None:
+    write(tmp_path / "a0.png", np.full((20, 30, 3), 90, np.uint8))
+    (tmp_path / "._a0.png").write_bytes(b"\0\5\x16\7 Mac OS X")
+    (tmp_path / ".trashed-1.jpg").write_bytes(b"")
+    assert photographs(tmp_path) == [tmp_path / "a0.png"]
+
+
 def test_times_of_the_exif_tags_order_the_frames(tmp_path: Path) -> None:
     for name, second in (("a.jpg", 30), ("b.jpg", 10), ("c.jpg", 20)):
         moment = f"2026:11:28 10:00:{second}"

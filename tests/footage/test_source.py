@@ -23,6 +23,12 @@ def test_photographs_of_one_folder_are_footage(tmp_path: Path) -> None:
     assert find_footage(fill(tmp_path, *names)) == tmp_path / "photos"
 
 
+def test_hidden_files_and_folders_do_not_count(tmp_path: Path) -> None:
+    names = [f"photos/{index}.jpg" for index in range(MIN_PHOTOGRAPHS)]
+    hidden = ("photos/._0.jpg", ".thumbnails/0.jpg", "out/.footage/frames/00000.png", ".DS_Store")
+    assert find_footage(fill(tmp_path, *names, *hidden)) == tmp_path / "photos"
+
+
 @pytest.mark.parametrize(
     "names",
     [

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,32 @@ def test_the_rotation_that_phones_store_is_applied(tmp_path: Path) -> None:
     assert image.shape[:2] == (64, 48)
     assert image[:28, :12, :3].mean() > 0.9
     assert image[36:].mean() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("aspect", "clockwise", "max_side", "size"),
+    [
+        (Fraction(4, 3), False, 200, (85, 48)),
+        (Fraction(4, 3), False, 64, (64, 36)),
+        (Fraction(3, 4), False, 200, (48, 48)),
+        (Fraction(3, 4), True, 200, (48, 48)),
+        (Fraction(4, 3), True, 64, (36, 64)),
+        (Fraction(1, 1), False, 200, (64, 48)),
+    ],
+)
+def test_pixels_that_are_not_square_become_square(
+    tmp_path: Path, aspect: Fraction, clockwise: bool, max_side: int, size: tuple[int, int]
+) -> None:
+    stored = np.full((48, 64, 3), 20, np.uint8)
+    stored[:, 32:] = 220
+    video = encode(tmp_path / "a.mp4", [stored] * 8, pixel_aspect=aspect, clockwise=clockwise)
+    extract(video, tmp_path / "out", max_side=max_side)
+    image = read_png(tmp_path / "out" / "00000.png")[..., :3]
+    assert image.shape[1::-1] == size
+    along = image.mean(axis=(1, 2)) if clockwise else image.mean(axis=(0, 2))  # what is stored across
+    half = len(along) // 2
+    assert along[: half - 2].max() < 0.2
+    assert along[half + 2 :].min() > 0.7
 
 
 def test_colours_survive_the_codec(tmp_path: Path) -> None:

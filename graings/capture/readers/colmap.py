@@ -20,7 +20,7 @@ from graings.capture.readers.colmap_camera import ColmapCamera, UndistortedCamer
 from graings.capture.readers.colmap_folder import MASKS, find_model, picture_folder
 from graings.capture.readers.colmap_model import ColmapImage, ColmapModel, read_model
 from graings.capture.readers.json_document import parse_json
-from graings.capture.readers.rig import with_rig
+from graings.capture.readers.rig import RigFrames, with_rig
 from graings.capture.readers.transforms_document import SINGLE_FILE, parse_transforms
 from graings.capture.splits import split_held_out, time_from_name
 from graings.config import CaptureConfig
@@ -37,8 +37,8 @@ def read_colmap(folder: CaptureFolder, config: CaptureConfig) -> RawCapture:
 
     Times: `times.json` ({image name: time}) beside `images/`, or those of a `transforms.json` that lists the same
     images, or with `times_from_names` the last number in the file name, else none. Masks: `masks/NAME.png`. Test split:
-    the names in `test.txt` beside the model, else every `test_every`-th by name. Val split: every `test_every`-th of
-    the rest (`split_held_out`). Raises `CaptureError`.
+    the names in `test.txt` beside the model, where an image of a rig stands for its whole camera, else every
+    `test_every`-th by name. Val split: every `test_every`-th of the rest (`split_held_out`). Raises `CaptureError`.
     """
     found = find_model(folder.root)
     assert found is not None  # load_capture chose this reader because there is one
@@ -51,9 +51,8 @@ def read_colmap(folder: CaptureFolder, config: CaptureConfig) -> RawCapture:
             remedy="Run the reconstruction again.",
         )
     notes = found.notes()
-    frames = _frames(folder, found.folder, model, config, notes)
-    frames = with_rig(folder, frames, config, notes)
-    splits = _splits(folder, found.folder, frames, config.test_every, notes)
+    frames = with_rig(folder, _frames(folder, found.folder, model, config, notes), config, notes)
+    splits = _splits(folder, found.folder, model, frames, config.test_every, notes)
     return RawCapture.with_points("colmap", splits, notes, model.positions, model.colors)
 
 
@@ -165,16 +164,18 @@ def _times_of_transforms(folder: CaptureFolder, names: list[str], place: str, no
 
 
 def _splits(
-    folder: CaptureFolder, model_folder: str, frames: dict[str, RawFrame], every: int, notes: list[str]
+    folder: CaptureFolder, model_folder: str, model: ColmapModel, rig: RigFrames, every: int, notes: list[str]
 ) -> dict[Split, tuple[RawFrame, ...]]:
     list_file = next((file for file in (f"{model_folder}/{TEST_FILE}", TEST_FILE) if folder.has(file)), None)
     if list_file is None:
-        return split_held_out(frames, every, notes, source=model_folder)
-    test = {line.strip() for line in folder.read(list_file).decode("utf-8", errors="surrogateescape").splitlines()}
-    unknown = sorted(test - set(frames) - {""})
+        return split_held_out(rig.frames, every, notes, source=model_folder)
+    listed = {line.strip() for line in folder.read(list_file).decode("utf-8", errors="surrogateescape").splitlines()}
+    registered = {image.name for image in model.images}  # a few of them may be missing on disk
+    unknown = sorted(listed - registered - set(rig.frames) - {""})
     if unknown:
         raise CaptureError(
             f"{unknown[0]!r} is no image of the model", file=list_file, remedy="Correct or remove the name."
         )
     notes.append(f"test images are those of {list_file}")
-    return split_held_out(frames, every, notes, source=list_file, test=test)
+    test = {frame for name in listed for frame in rig.named(name)}
+    return split_held_out(rig.frames, every, notes, source=list_file, test=test)

@@ -36,6 +36,12 @@ CAMERA_MODELS: Final[dict[int, tuple[str, int, int]]] = {
     15: ("FISHEYE", 4, 2),
     16: ("EUCM", 6, 2),
 }
+# Models that show all directions.
+PANORAMIC_MODELS: Final[dict[int, str]] = {17: "EQUIRECTANGULAR"}
+PANORAMA_REMEDY: Final = (
+    "Cut each picture into perspective views with poses of their own, for example with `ns-process-data "
+    "images --camera-type equirectangular` or COLMAP's script panorama_sfm."
+)
 MODELS: Final = {name: (count, focals) for name, count, focals in CAMERA_MODELS.values()}
 
 
@@ -89,6 +95,11 @@ class ColmapCamera:
                 field=field,
                 remedy="Undistort with `colmap image_undistorter` and give its output.",
             ) from error
+
+
+def panorama_problem(model: str) -> str:
+    """Why pictures of a panoramic `model` are refused."""
+    return f"pictures of the camera model {model} show all directions, which no single perspective view can"
 
 
 class UndistortedCameras:

@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graings.capture.folder import CaptureFolder
-from graings.capture.readers.colmap_camera import CAMERA_MODELS, MODELS, ColmapCamera
+from graings.capture.readers.colmap_camera import (
+    CAMERA_MODELS,
+    MODELS,
+    PANORAMA_REMEDY,
+    PANORAMIC_MODELS,
+    ColmapCamera,
+    panorama_problem,
+)
 from graings.errors import CaptureError
 
 MIN_QUATERNION_NORM = 1e-6
@@ -122,6 +129,8 @@ def _cameras_bin(file: _Binary) -> dict[int, ColmapCamera]:
     cameras: dict[int, ColmapCamera] = {}
     for _ in file.count():
         identifier, model, width, height = (int(value) for value in file.take("<IiQQ"))
+        if model in PANORAMIC_MODELS:
+            raise _panorama(file.name, f"camera {identifier}", PANORAMIC_MODELS[model])
         if model not in CAMERA_MODELS:
             file.fail(f"camera {identifier} has the unknown model {model}")
         name, count, _ = CAMERA_MODELS[model]
@@ -157,11 +166,17 @@ def _cameras_txt(file: _Text) -> dict[int, ColmapCamera]:
             params = tuple(float(word) for word in words[4:])
         except (ValueError, IndexError):
             file.fail(number, "is no camera (id, model, width, height, parameters)")
+        if name in PANORAMIC_MODELS.values():
+            raise _panorama(file.name, f"line {number + 1}", name)
         if name not in MODELS:
             file.fail(number, f"camera {identifier} has the unknown model {name}")
         cameras[identifier] = _camera(file, identifier, name, width, height, params, number)
     file.finish(len(cameras))
     return cameras
+
+
+def _panorama(file: str, field: str, model: str) -> CaptureError:
+    return CaptureError(panorama_problem(model), file=file, field=field, remedy=PANORAMA_REMEDY)
 
 
 def _images_txt(file: _Text) -> tuple[ColmapImage, ...]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Annotated, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter
 
 from graings.capture.capture import Split
 from graings.capture.folder import CaptureFolder
@@ -21,6 +21,7 @@ from graings.capture.raw_capture import RawCapture, RawFrame
 from graings.capture.readers.array_file import read_array
 from graings.capture.readers.colmap_camera import ColmapCamera, UndistortedCameras, undistortion_notes
 from graings.capture.readers.json_document import parse_json
+from graings.capture.readers.rig import refuse_rig
 from graings.capture.splits import split_held_out
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
@@ -74,7 +75,10 @@ class CameraEntry(_Document):
     skew: float = 0.0
     pixel_aspect_ratio: Annotated[float, Field(gt=0)] = 1.0
     radial_distortion: Vector = (0.0, 0.0, 0.0)
-    tangential_distortion: tuple[float, float] = (0.0, 0.0)
+    # Nerfies called it `tangential` first, and reads that key still.
+    tangential_distortion: tuple[float, float] = Field(
+        (0.0, 0.0), validation_alias=AliasChoices("tangential", "tangential_distortion")
+    )
 
 
 _DATASET, _CAMERA = TypeAdapter(Dataset), TypeAdapter(CameraEntry)
@@ -92,6 +96,7 @@ def read_nerfies(folder: CaptureFolder, config: CaptureConfig) -> RawCapture:
     The splits are `train_ids` and `val_ids`; without `val_ids` images are held out (`split_held_out`). Raises
     `CaptureError` naming file and field.
     """
+    refuse_rig(config, DATASET)
     dataset = parse_json(_DATASET, folder.read(DATASET), DATASET)
     metadata = parse_json(_METADATA, folder.read(METADATA), METADATA)
     scale = _scale(folder, dataset.ids[0], config.max_side)

@@ -34,7 +34,7 @@ def read_poses_bounds(folder: CaptureFolder, config: CaptureConfig) -> RawCaptur
     rows = read_array(folder, FILE, columns=17)
     cameras = UndistortedCameras(FILE)
     frames: dict[str, RawFrame] = {}
-    sources, is_rig = _sources(folder, len(rows))
+    sources, is_rig = _sources(folder, len(rows), config.rig)
     for index, (row, files) in enumerate(zip(rows, sources, strict=True)):
         pose, (height, width, focal) = _pose(row, index)
         for file in files:
@@ -53,17 +53,18 @@ def read_poses_bounds(folder: CaptureFolder, config: CaptureConfig) -> RawCaptur
     return RawCapture("llff", splits, tuple(notes))
 
 
-def _sources(folder: CaptureFolder, count: int) -> tuple[list[list[str]], bool]:
-    """The files of each row, and whether the rows are cameras with several frames each."""
+def _sources(folder: CaptureFolder, count: int, rig: bool) -> tuple[list[list[str]], bool]:
+    """The files of each row, and whether the rows are cameras with several frames each, as they must be with `rig`."""
     found = []
     for place in IMAGE_FOLDERS:
         images = pictures(folder, place)
         found.append(f"{len(images)} in {place}")
-        if len(images) == count:
+        if len(images) == count and not rig:
             return [[image] for image in images], False
     for place in (".", "images"):
         root = folder.root / place
         inner = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+        inner = [name for name in inner if name not in IMAGE_FOLDERS]  # the calibrated pictures, not a camera's frames
         frames = [files for files in (_frames(folder, str(Path(place, name))) for name in inner) if len(files) > 1]
         if len(frames) == count:
             return frames, True

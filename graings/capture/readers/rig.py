@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -17,12 +18,25 @@ from graings.errors import CaptureError
 VIDEO_SUFFIXES: Final = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
 
+@dataclass(frozen=True, slots=True)
+class RigFrames:
+    """Frames by name, and the names of those that each listed image stands for: itself, or all of its camera."""
+
+    frames: dict[str, RawFrame]
+    of_image: dict[str, tuple[str, ...]]
+
+    def named(self, name: str) -> tuple[str, ...]:
+        """The names of the frames that `name` means, which is that of a listed image or of a frame; () for others."""
+        return self.of_image.get(name, (name,) if name in self.frames else ())
+
+
 def with_rig(
     folder: CaptureFolder, frames: Mapping[str, RawFrame], config: CaptureConfig, notes: list[str]
-) -> dict[str, RawFrame]:
+) -> RigFrames:
     """With `config.rig` every frame of the folder of each calibrated image, else `frames` and how to get them.
 
-    The number in a frame's name is its time. Raises `CaptureError` where a camera has no folder.
+    The number in a frame's name is its time; the mask of a calibrated image is that of its camera. Raises
+    `CaptureError` where a camera has no folder.
     """
     folders = {name: frame_folder(folder, name) for name in frames}
     found = {name: place for name, place in folders.items() if place is not None}
@@ -33,7 +47,8 @@ def with_rig(
                 f"the images are of one instant: {count} frames of {len(found)} cameras lie in folders of their names "
                 f"({next(iter(found.values()))}, …) and are not used; set capture.rig=true to read them"
             )
-        return dict(frames)
+        return RigFrames(dict(frames), {name: (name,) for name in frames})
+    of_image: dict[str, tuple[str, ...]] = {}
     timed: dict[str, RawFrame] = {}
     for name, frame in frames.items():
         if name not in found:
@@ -44,11 +59,24 @@ def with_rig(
                 field="capture.rig",
                 remedy="Put the frames of each camera into a folder of its name.",
             )
-        for picture in pictures(folder, found[name]):
-            image = _like(folder.image(picture, source=found[name]), frame)
-            timed[image.name] = RawFrame(image, frame.camera, time_from_name(image.name), frame.lens)
-    notes.append(f"a rig: {len(timed)} frames of {len(frames)} cameras, with the numbers in their names as times")
-    return timed
+        place = found[name]
+        images = [_like(folder.image(picture, source=place), frame) for picture in pictures(folder, place)]
+        timed |= {image.name: replace(frame, image=image, time=time_from_name(image.name)) for image in images}
+        of_image[name] = tuple(image.name for image in images)
+    if frames:
+        notes.append(f"a rig: {len(timed)} frames of {len(frames)} cameras, with the numbers in their names as times")
+    return RigFrames(timed, of_image)
+
+
+def refuse_rig(config: CaptureConfig, file: str) -> None:
+    """Raise `CaptureError` with `config.rig`, for a format whose `file` lists every frame itself."""
+    if config.rig:
+        raise CaptureError(
+            "lists every frame itself, so that no folders of frames are read beside it",
+            file=file,
+            field="capture.rig",
+            remedy="Set capture.rig=false.",
+        )
 
 
 def frame_folder(folder: CaptureFolder, name: str) -> str | None:

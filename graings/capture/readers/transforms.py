@@ -11,7 +11,7 @@ from graings.capture.listed_images import ListedImages
 from graings.capture.raw_capture import RawCapture, RawFrame
 from graings.capture.readers.colmap_camera import undistortion_notes
 from graings.capture.readers.ply import read_ply
-from graings.capture.readers.rig import with_rig
+from graings.capture.readers.rig import RigFrames, with_rig
 from graings.capture.readers.transforms_camera import TransformsCamera
 from graings.capture.readers.transforms_document import (
     SINGLE_FILE,
@@ -53,6 +53,9 @@ def read_transforms(folder: CaptureFolder, config: CaptureConfig) -> RawCapture:
     lone = len(splits) == 1 or (left_out and not any(splits[split] for split in splits if split != "train"))
     if lone:
         return _split(folder, content, train, split_file("train"), config, notes)
+    if config.rig:
+        rigs = {split: with_rig(folder, _by_name(frames), config, notes) for split, frames in splits.items()}
+        splits = {split: tuple(rig.frames.values()) for split, rig in rigs.items()}
     notes += undistortion_notes(frame.lens for frames in splits.values() for frame in frames)
     return _with_points(folder, content, splits, split_file("train"), [*notes, *_overlap_notes(splits)])
 
@@ -83,12 +86,15 @@ def _split(
 ) -> RawCapture:
     """The capture of the frames of one `file`, in splits as it lists them or as images are held out."""
     notes += undistortion_notes(frame.lens for frame in listed)
-    frames = {frame.image.name: frame for frame in sorted(listed, key=lambda frame: frame.image.name)}
-    frames = with_rig(folder, frames, config, notes)
+    frames = with_rig(folder, _by_name(listed), config, notes)
     splits = _listed_splits(folder, content, frames, file, notes)
     if splits is None:
-        splits = split_held_out(frames, config.test_every, notes, source=file)
+        splits = split_held_out(frames.frames, config.test_every, notes, source=file)
     return _with_points(folder, content, splits, file, notes)
+
+
+def _by_name(frames: tuple[RawFrame, ...]) -> dict[str, RawFrame]:
+    return {frame.image.name: frame for frame in sorted(frames, key=lambda frame: frame.image.name)}
 
 
 def _with_points(
@@ -116,7 +122,8 @@ def _frames(
     scales: list[float] = []
     images = ListedImages(folder, file)
     cameras = TransformsCamera(content, file, config.orientation)
-    times_from_names = config.times_from_names and all(entry.time is None for entry in content.frames)
+    untimed = all(entry.time is None for entry in content.frames)
+    times_from_names = config.times_from_names and untimed and not config.rig
     for index, entry in enumerate(content.frames):
         field = f"frames[{index}]"
         image = images.find(entry.file_path, f"{field}.file_path")
@@ -142,7 +149,7 @@ def _frames(
 
 
 def _listed_splits(
-    folder: CaptureFolder, content: Transforms, frames: dict[str, RawFrame], file: str, notes: list[str]
+    folder: CaptureFolder, content: Transforms, rig: RigFrames, file: str, notes: list[str]
 ) -> dict[Split, tuple[RawFrame, ...]] | None:
     """The splits that the file lists, or None. Without `train_filenames` all frames that are not held out are train."""
     if all(content.listed(split) is None for split in SPLITS):
@@ -155,11 +162,13 @@ def _listed_splits(
             name = folder.find(listed, source=file, field=field)
             if name is None and any(listed == entry.file_path for entry in content.frames):
                 continue  # one of the missing images, which have been counted
-            if name not in frames:
+            meant = rig.named(name or listed)
+            if not meant:
                 raise CaptureError(
                     f"{listed!r} is no image of frames", file=file, field=field, remedy="Correct or remove the name."
                 )
-            names[split].add(name)
+            names[split].update(meant)
+    frames = rig.frames
     held_out = names["val"] | names["test"]
     if content.train_filenames is None:
         names["train"] = set(frames) - held_out

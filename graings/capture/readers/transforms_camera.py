@@ -13,7 +13,12 @@ from graings.camera.camera import Camera
 from graings.capture.image_file import ImageFile
 from graings.capture.lens import Lens
 from graings.capture.orientation import Orientation, image_scale, named_size, oriented
-from graings.capture.readers.colmap_camera import ColmapCamera, UndistortedCameras
+from graings.capture.readers.colmap_camera import (
+    PANORAMA_REMEDY,
+    ColmapCamera,
+    UndistortedCameras,
+    panorama_problem,
+)
 from graings.errors import CaptureError
 
 Angle = Annotated[float, Field(gt=0, lt=math.pi)]
@@ -30,7 +35,12 @@ THIN_PRISM: Final = "THIN_PRISM_FISHEYE"
 FISHEYE: Final = frozenset(("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", THIN_PRISM))
 FIELD_OF_VIEW: Final = "FOV"
 # Names of pictures that show all directions.
-PANORAMIC: Final = frozenset(("EQUIRECTANGULAR", "SPHERICAL", "PANORAMA", "OMNIDIRECTIONALSTEREO_L", "VR180_L"))
+PANORAMIC: Final = frozenset(
+    (
+        *("EQUIRECTANGULAR", "SPHERICAL", "PANORAMA"),
+        *("OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R", "VR180_L", "VR180_R"),
+    )
+)
 
 
 class Intrinsics(BaseModel):
@@ -92,11 +102,7 @@ class TransformsCamera:
         p1, p2, sx1, sy1 = (self._coefficient(frame, key) for key in ("p1", "p2", "sx1", "sy1"))
         problem, remedy = None, "Undistort the images first, or give the COLMAP folder instead."
         if name is not None and name.upper() in PANORAMIC:
-            problem = f"pictures of the camera model {name} show all directions, which no single perspective view can"
-            remedy = (
-                "Cut each picture into perspective views with poses of their own, for example with `ns-process-data "
-                "images --camera-type equirectangular` or COLMAP's script panorama_sfm."
-            )
+            problem, remedy = panorama_problem(name), PANORAMA_REMEDY
         elif name is not None and name not in PERSPECTIVE | FISHEYE | {FIELD_OF_VIEW}:
             problem = f"the camera model {name} is not supported"
         elif fisheye and name != THIN_PRISM and any((p1, p2, sx1, sy1)):
