@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
+import time
 from pathlib import Path
 
 from graings.capture.synthetic import find_recipe, synthesize
@@ -20,12 +21,19 @@ class Stopped(Exception):
 
 
 def capture_of(
-    upload: Path, folder: JobFolder, threads: int, iterations: int, progress: ProgressWriter, stop: threading.Event
+    upload: Path,
+    folder: JobFolder,
+    threads: int,
+    iterations: int,
+    phase_s: dict[str, float],
+    progress: ProgressWriter,
+    stop: threading.Event,
 ) -> tuple[Path, list[str]]:
     """The capture to train on: `upload` itself, or what is made of its footage or recipe; and lines for the log.
 
-    An interrupted call continues where it was; a synthetic scene, which takes seconds, begins again. Raises `Stopped`
-    when `stop` is set, and `CaptureError` where the footage does not hold together.
+    An interrupted call continues where it was; a synthetic scene, which takes seconds, begins again. `phase_s` are the
+    seconds of the job in each phase, to which those of this one are added. Raises `Stopped` when `stop` is set, and
+    `CaptureError` where the footage does not hold together.
     """
     recipe = find_recipe(upload)
     footage = None if recipe else find_footage(upload)
@@ -34,8 +42,16 @@ def capture_of(
     if (folder.capture / TRANSFORMS).exists():
         return folder.capture, []
     attempts = folder.attempts()
+    changed = time.monotonic()
+
+    def book() -> None:
+        nonlocal changed
+        now = time.monotonic()
+        phase_s["capture"] = phase_s.get("capture", 0.0) + now - changed
+        changed = now
 
     def observe(step: str, done: int, total: int) -> None:
+        book()
         progress.write(
             ProgressReport(
                 phase="capture",
@@ -45,6 +61,7 @@ def capture_of(
                 iteration=0,
                 iterations=iterations,
                 attempt=attempts[-1].number if attempts else 1,
+                phase_s=phase_s,
             )
         )
         if stop.is_set():
@@ -59,6 +76,7 @@ def capture_of(
             **recipe.model_dump(exclude={"scene"}),
             observe=lambda done, total: observe("drawing", done, total),
         )
+        book()
         return folder.capture, [f"drew the synthetic scene {recipe.scene}"]
     assert footage is not None
     try:
@@ -66,4 +84,5 @@ def capture_of(
     except CaptureError as error:
         # Its client knows the names of the files, and nothing of the folders of this machine.
         raise CaptureError(error.problem, file=Path(error.file).name, field=error.field, remedy=error.remedy) from error
+    book()
     return folder.capture, lines(report)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping, Sequence, Set
+from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any, cast
@@ -19,6 +19,7 @@ from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, Enque
 from dbos import error as dbos_error
 from sqlalchemy import exc
 
+from jobs.at_work import AtWork
 from jobs.database_url import SQLITE_PREFIX, cannot_open, no_answer, with_connection_limits
 from jobs.job import JobConflict, JobState, Outcome
 
@@ -200,10 +201,10 @@ def executing(
     run: Callable[[str], Awaitable[Outcome]],
     deliver: Callable[[str, str, dict[str, Any], int], None],
     run_task: Callable[[str, str], Awaitable[Outcome]],
-) -> Iterator[Set[str]]:
+) -> Iterator[AtWork]:
     """Take jobs from the queue while the context lasts, `slots` at a time, and await `run(job_id)` for each.
 
-    Yields the ids of what is at work: jobs, messages and tasks.
+    Yields what is at work: jobs, messages and tasks.
 
     `deliver` sends one message (id, job, content, attempt), `run_task` does one task (job, task), one at a time. `run`
     and `run_task` are cancelled within two seconds after their work is cancelled or the context ends; they then have
@@ -223,15 +224,7 @@ def executing(
     )
     DBOS(config=config)
 
-    at_work: set[str] = set()
-
-    @contextmanager
-    def working() -> Iterator[None]:
-        at_work.add(str(DBOS.workflow_id))
-        try:
-            yield
-        finally:
-            at_work.discard(str(DBOS.workflow_id))
+    at_work = AtWork()
 
     @DBOS.step(name="run", preemptible=True)
     async def step(job_id: str) -> dict[str, Any]:
@@ -239,12 +232,12 @@ def executing(
 
     @DBOS.workflow(name=QUEUE)
     async def workflow(job_id: str) -> dict[str, Any]:
-        with working():
+        with at_work.doing(str(DBOS.workflow_id)):
             return await step(job_id)
 
     @DBOS.workflow(name=MESSAGES)
     def messages(message_id: str, job_id: str, content: dict[str, Any], attempt: int) -> None:
-        with working():
+        with at_work.doing(str(DBOS.workflow_id)):
             DBOS.run_step({"name": "deliver"}, deliver, message_id, job_id, content, attempt)
 
     @DBOS.step(name="task", preemptible=True)
@@ -253,7 +246,7 @@ def executing(
 
     @DBOS.workflow(name=TASKS)
     async def task(job_id: str, number: str) -> dict[str, Any]:
-        with working():
+        with at_work.doing(str(DBOS.workflow_id)):
             return await task_step(job_id, number)
 
     DBOS.listen_queues(list(_QUEUES))

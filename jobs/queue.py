@@ -156,8 +156,14 @@ class JobQueue:
             job = self.get(job_id)
             if job.state is not JobState.SUCCEEDED:
                 raise JobConflict(f"Job {job_id} is {job.state}; only one that has succeeded can be extended.")
-            self.store.folder(job_id).write_spec(job.spec.extended(iterations))
-            self._engine.rewind(job_id)
+            folder = self.store.folder(job_id)
+            folder.write_spec(job.spec.extended(iterations))
+            try:
+                self._engine.rewind(job_id)
+            except BaseException:
+                # The client gets an error and will ask again, which must not extend the job twice.
+                folder.write_spec(job.spec)
+                raise
         return self.get(job_id)
 
     def tell(self, job_id: str, event: str, number: int = 0, **changes: Any) -> None:

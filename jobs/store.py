@@ -217,11 +217,14 @@ class Store:
             secret = "whsec_" + b64encode(os.urandom(32)).decode() if spec.webhook else None
             stored = {"spec": {**values, "webhook_secret": secret}, "submitted": values}
             write_json(part / "job.json", {"id": job_id, "created_at": now, **stored})
+            if key is not None:
+                # Before the job is there: the request will be repeated if this process dies in between, and must find
+                # the job. A link to a job that is not there counts as none.
+                submission.unlink(missing_ok=True)
+                submission.symlink_to(self._jobs / job_id)
+                sync(self._submissions)
             part.rename(self._jobs / job_id)
             sync(self._jobs)
-            if key is not None:
-                submission.unlink(missing_ok=True)  # that of a deleted job
-                submission.symlink_to(self._jobs / job_id)
         return job_id
 
     def folder(self, job_id: str) -> JobFolder:

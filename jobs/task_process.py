@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from graings.errors import GraingsError
+from graings.errors import CheckpointError, GraingsError
 from graings.export.camera_path import frames_of
 from graings.export.shown import open_shown
 from graings.export.video import write_video
@@ -31,6 +31,7 @@ from jobs.store import JobFolder, Store
 from jobs.task import EvaluationSpec, TaskFolder, VideoSpec
 
 REPORT_EVERY_S = 0.5
+LOCK_WAIT_S = 10.0  # for a trainer that is about to end; one that trains would block all tasks of the worker for hours
 
 
 class Ended(BaseException):
@@ -69,8 +70,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _evaluate(folder: JobFolder, spec: EvaluationSpec) -> None:
     capture = Store(folder.path.parent.parent).trained_on(folder.path.name)
-    with locked(folder.lock):  # a trainer writes the same metrics
-        evaluate_run(folder.run, spec.split, capture)
+    deadline = time.monotonic() + LOCK_WAIT_S
+    while True:
+        with locked(folder.lock, wait=False) as free:  # a trainer writes the same metrics
+            if free:
+                evaluate_run(folder.run, spec.split, capture)
+                return
+        if time.monotonic() >= deadline:
+            raise CheckpointError(f"Job {folder.path.name} is being trained. Evaluate it when it has ended.")
+        time.sleep(0.2)
 
 
 def _make_video(folder: JobFolder, task: TaskFolder, spec: VideoSpec) -> None:

@@ -90,10 +90,11 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
     checkpoint = folder.checkpoint()
     attempts = folder.attempts()
     attempt = attempts[-1].number if attempts else 1
-    earlier, began = last_progress(folder.progress), time.monotonic()
+    earlier = last_progress(folder.progress)
     phase_s = dict(earlier.phase_s) if earlier else {}
     progress = ProgressWriter(folder.progress)
-    capture, found = capture_of(upload, folder, threads, config.iterations, progress, stop)
+    capture, found = capture_of(upload, folder, threads, config.iterations, phase_s, progress, stop)
+    began = time.monotonic()
     for line in found:
         _log(line)
     progress.write(
@@ -140,6 +141,7 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
                 iteration=run.iteration,
                 iterations=run.iterations,
                 attempt=attempt,
+                phase_s=phase_s,
                 events=(Diverged(iteration=run.iteration, reason=str(error)),),
                 **held_out,
             )

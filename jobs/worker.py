@@ -14,9 +14,10 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
 
+from jobs.at_work import AtWork
 from jobs.child_process import GRACE_S, ChildProcess, ProcessExit
 from jobs.engine import Engine, executing
 from jobs.exit_code import OUT_OF_MEMORY, ExitCode
@@ -83,7 +84,7 @@ class Worker:
             return False
         return True
 
-    def _supervise(self, engine: Engine, leases: Leases, at_work: Set[str], stop: threading.Event) -> None:
+    def _supervise(self, engine: Engine, leases: Leases, at_work: AtWork, stop: threading.Event) -> None:
         while True:
             try:
                 if not leases.renew(self.id):
@@ -94,7 +95,8 @@ class Worker:
                 taken = engine.taken()
                 self._tell_checkpoints([job_id for job_id, _ in trainers])
                 requeue_work_of_dead_workers(engine, leases, taken, self.id)
-                self._requeue_forgotten(engine, {entry for entry, own in taken.items() if own == self.id} - at_work)
+                ours = {entry for entry, executor in taken.items() if executor == self.id}
+                self._requeue_forgotten(engine, ours - at_work.ids())
                 for job_id, trainer in trainers:
                     if taken.get(job_id) != self.id and not trainer.stopping:
                         LOG.warning("job %s was cancelled or given to another worker: stopping its trainer", job_id)
@@ -175,7 +177,9 @@ class Worker:
                 folder.end_attempt(attempt, ExitCode.STOPPED)
                 raise
             LOG.info("job %s: attempt %d ended with code %d", job_id, attempt.number, ending.code)
-            folder.end_attempt(attempt, ending.code, ending.message)
+            # A stop that finds the trainer importing, or busy beyond its grace time, ends it by a signal: no crash.
+            stopped = trainer.stopping and ending.code < 0
+            folder.end_attempt(attempt, ExitCode.STOPPED if stopped else ending.code, ending.message)
             outcome = _outcome(ending)
             if outcome is not None:
                 folder.close_attempts()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import TracebackType
 
 from rich.console import Console
@@ -60,13 +61,14 @@ class TrainingProgress:
 
     def show(self, step: RunReport) -> None:
         """Move the bar to `step`; print its evaluation and events as lines."""
+        unknown = math.isnan(step.psnr)  # an earlier process took the step
         self._bar.update(
             self._task,
             description=step.phase,
             completed=step.iteration,
             total=step.iterations,
             speed=step.iterations_per_s,
-            psnr=step.psnr,
+            psnr=self._bar.tasks[0].fields["psnr"] if unknown else step.psnr,
             gaussians=step.gaussians,
             anchors=step.anchors,
         )

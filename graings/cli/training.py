@@ -20,6 +20,7 @@ from graings.cli.terminal import busy_status, metrics_line, print_line
 from graings.config import PRESETS, make_config
 from graings.plan.rules import nothing_shown
 from graings.report.metrics_document import read_metrics
+from graings.storage.checkpoint import newest_checkpoint
 from graings.storage.run_folder import RECORD_FILE
 from graings.training.run import TrainingRun
 
@@ -73,7 +74,7 @@ def train(
                 raise
     interrupt = _take_steps(run)
     if run.iteration < run.iterations:
-        print_line(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations, at a checkpoint.")
+        print_line(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations, {where_it_goes_on(run)}.")
         print_line(f"Continue with: graings train --resume -o {run.folder}")
         raise typer.Exit(interrupt.exit_code)
     _print_result(run)
@@ -136,6 +137,14 @@ def ablate(
                 f"{row.label:>22}  {mean:.2f} dB" + (f"  {signed(difference)}" if difference is not None else "")
             )
     print_line(f"The table is in {output / 'ablation.md'}, with ablation.json and ablation.svg beside it.")
+
+
+def where_it_goes_on(run: TrainingRun) -> str:
+    """Where a run that was stopped will go on."""
+    newest = newest_checkpoint(run.folder)
+    if newest is None or int(newest.name) == run.iteration:
+        return "at a checkpoint"
+    return f"with the checkpoint of iteration {int(newest.name):,}, as the loss is far above its best"
 
 
 def check_one_preset(preset: str, overrides: dict[str, Any]) -> None:

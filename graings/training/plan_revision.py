@@ -26,11 +26,12 @@ class PlanRevision:
     """The plan in the `log` of a run, revised while it trains.
 
     A residual is left out once two evaluations in a row find that it changes no training view by half a grey level.
+    What the next decision depends on is in the log, which is part of a checkpoint. The `log` has the plan of the start.
     """
 
     def __init__(self, log: TrainingLog) -> None:
         self.log = log
-        self._below = 0  # evaluations in a row that found the residual's bound below the limit
+        self._planned = log.plan
         self._recent: deque[float] = deque(maxlen=COMPARED_STEPS)  # CPU seconds of the last joint steps
         self._before: float | None = None  # CPU seconds of a step before the residual was left out
 
@@ -41,6 +42,14 @@ class PlanRevision:
         for event in step.events:
             if isinstance(event, GrowthQuiet):
                 self._note_growth(event)
+
+    def begin_again(self) -> None:
+        """Training starts again: what it has found was about the scene before."""
+        self.log.plan = self._planned
+        self.log.residual_unseen = 0
+        self._recent.clear()
+        self._before = None
+        self.write()
 
     @property
     def plan(self) -> Plan:
@@ -57,7 +66,8 @@ class PlanRevision:
         return events
 
     def _judge_residual(self, trainer: Trainer, iteration: int) -> tuple[Event, ...]:
-        decision = self.plan.decision("residual")
+        # As planned: a rollback may have brought back a residual that the plan had left out.
+        decision = self._planned.decision("residual")
         if decision is None or decision.kind != "bounded" or trainer.scene.residual is None:
             return ()
         if trainer.iteration < (decision.iteration or 0):
@@ -65,8 +75,8 @@ class PlanRevision:
         if trainer.iteration > trainer.config.scaled(trainer.config.average_from):
             return ()  # the trained model is the mean of these steps, in which no part may change
         bound = residual_bound(trainer.scene, trainer.capture.train, trainer.background, HALF_LEVEL)
-        self._below = self._below + 1 if bound <= HALF_LEVEL else 0
-        drop = self._below >= 2
+        self.log.residual_unseen = self.log.residual_unseen + 1 if bound <= HALF_LEVEL else 0
+        drop = self.log.residual_unseen >= 2
         self._record(decision, bound, iteration if drop else None)
         if not drop:
             return ()
@@ -125,6 +135,8 @@ class PlanRevision:
             "reason": f"no anchor was added from there on in {event.growths} growths",
         }
         self.log.plan = self.plan.revised(decision.model_copy(update=update))
+        with self.log.clock.timed("report"):
+            self.write()
 
 
 def _with_view_loss(plan: Plan, loss: float | None) -> Plan:

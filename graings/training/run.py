@@ -21,16 +21,9 @@ from graings.plan.capture_statistics import measure
 from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan, make_plan
 from graings.report.events import Diverged, Event
-from graings.report.metrics_document import EvaluationPoint, read_metrics
-from graings.report.run_record import read_plan, read_record
-from graings.storage.checkpoint import (
-    best_checkpoint,
-    intact,
-    load_model,
-    load_state,
-    load_training,
-    newest_checkpoint,
-)
+from graings.report.metrics_document import EvaluationPoint
+from graings.report.run_record import read_record
+from graings.storage.checkpoint import intact, load_training, newest_checkpoint
 from graings.storage.run_folder import METRICS_FILE, RECORD_FILE, check_unused, sole_trainer
 from graings.training.curriculum.missing_motion import MissingMotion, check_iteration
 from graings.training.curriculum.restart import RestartState
@@ -114,7 +107,7 @@ class TrainingRun:
         if data.content_hash != record.capture.hash:
             raise CheckpointError(f"{data.root}: not the capture this run began with. Give the original one.")
         with clock.timed("init"):
-            run = cls(folder, data, config, threads, clock, read_plan(folder) or record.plan)
+            run = cls(folder, data, config, threads, clock, record.plan)
         if newest_checkpoint(folder) is None:
             run._start()
             return run
@@ -174,9 +167,16 @@ class TrainingRun:
                 raise
 
     def _train(self) -> Iterator[RunReport]:
-        if self.iteration >= self.iterations and not self._is_complete():
-            # Interrupted between the last step and the last file: only the end remains to be done.
-            self._finish()
+        if self.iteration >= self.iterations:
+            interrupted = not self.log.is_complete(self.iterations)
+            if interrupted:
+                # Between the last step and the last file: only the end remains to be done.
+                self.log.forget_end(self.iteration)
+                self._finish()
+            yield self.output.last_report(self._trainer, self.iterations, events=interrupted)
+            return
+        with self.log.clock.timed("report"):
+            self.revision.write()  # that of a killed process may be newer than its checkpoint
         rate = Rate()
         while self.iteration < self.iterations:
             step = self._trainer.step()
@@ -194,7 +194,7 @@ class TrainingRun:
             events += self.revision.revise(self._trainer, self.iteration) if evaluating and not last else ()
             events += self._restart_if_motion_is_missing()
             if saving and not last:
-                self._save()
+                self._save_unless_diverging()
             if last:
                 point, more = self._finish()
                 events += more
@@ -207,15 +207,23 @@ class TrainingRun:
             )
 
     def save(self) -> Path:
-        """Write a checkpoint now; returns its folder. Raises `CheckpointError` when that fails.
+        """Write a checkpoint now; returns the newest one. Raises `CheckpointError` when that fails.
 
-        A scene with a NaN is never written: training rolls back first, or raises `DivergedError`.
+        That is an earlier one while the loss is far above its best; a resumed run repeats the steps since then. A scene
+        with a NaN is never written: training rolls back first, or raises `DivergedError`.
         """
         try:
             self._check()
         except DivergedError as error:
             self._deliver_best(str(error))
             raise
+        return self._save_unless_diverging()
+
+    def _save_unless_diverging(self) -> Path:
+        """A resumed run has no snapshot but its checkpoint, and must not have to return to a diverging scene."""
+        earlier = newest_checkpoint(self.folder)
+        if earlier is not None and self._trainer.guard.diverging:
+            return earlier
         return self._save()
 
     def _check(self) -> tuple[Event, ...]:
@@ -239,6 +247,7 @@ class TrainingRun:
         if found is None or (found.tracks is None and trainer.window.share(1) < 1):
             return ()
         event = found.event(self.iteration)
+        self.revision.begin_again()
         self._start(RestartState(self.iteration, found.time_window, found.tracks is not None), found.tracks)
         self.log.note([event])
         return (event,)
@@ -272,29 +281,13 @@ class TrainingRun:
     def _deliver_best(self, reason: str) -> None:
         """Training has diverged: make the best model the newest checkpoint, and write the reason into the metrics.
 
-        The best is that of the last snapshot or of the best evaluation, whichever has the higher held-out PSNR. Later
-        checkpoints are removed.
+        Later checkpoints are removed.
         """
         trainer = self._trainer
         self.log.note([Diverged(iteration=self.iteration, reason=reason)])
         self.log.diverged = reason
-        guard = trainer.guard
-        trainer.restore()
-        best, frames = best_checkpoint(self.folder), self.output.held_out()
-        if best is not None and self._best_psnr is not None and frames:
-            now = self.output.psnr(trainer, frames)
-            if now is None or self._best_psnr >= now:
-                state = load_state(best)
-                trainer.adopt(load_model(best).scene, state.tensors, state.facts["trainer"], guard)
-                self.log.gaussians = int(state.facts["gaussians"])
+        self.output.return_to_best(trainer, self._best_psnr)
         splits = self.output.splits(trainer)
         self._save(instead_of_later=True)
         compact, stiffness = self.output.export(trainer), self.output.stiffness(trainer)
         self.output.write_metrics(trainer, self.iteration, self.iterations, splits, compact, stiffness)
-
-    def _is_complete(self) -> bool:
-        """Whether the metrics document is that of the last iteration."""
-        if not self.metrics_path.exists():
-            return False
-        document = read_metrics(self.metrics_path)
-        return document.iterations == self.iterations and bool(document.splits or not self.capture.val)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -122,6 +123,21 @@ class RunOutput:
         """Mean PSNR of the scene as it is over `frames`, in dB."""
         return evaluate(trainer.scene, frames, self.images, trainer.background).psnr
 
+    def return_to_best(self, trainer: Trainer, best_psnr: float | None) -> None:
+        """Return to the last snapshot or to the best evaluation, whichever has the higher held-out PSNR.
+
+        `best_psnr` is that of the best evaluation, None where there is none.
+        """
+        guard = trainer.guard
+        trainer.restore()
+        best, frames = best_checkpoint(self.folder), self.held_out()
+        if best is not None and best_psnr is not None and frames:
+            now = self.psnr(trainer, frames)
+            if now is None or best_psnr >= now:
+                state = load_state(best)
+                trainer.adopt(load_model(best).scene, state.tensors, state.facts["trainer"], guard)
+                self.log.gaussians = int(state.facts["gaussians"])
+
     def save(
         self,
         trainer: Trainer,
@@ -181,6 +197,28 @@ class RunOutput:
             self.render_fps,
             compact,
             stiffness,
+        )
+
+    def last_report(self, trainer: Trainer, iterations: int, *, events: bool) -> RunReport:
+        """The report of the last of all `iterations`, where an earlier process took that step; its loss is not known.
+
+        With or without the `events` of that iteration.
+        """
+        iteration, points = trainer.run_iteration, self.log.curve[-1:]
+        return RunReport(
+            iteration=iteration,
+            iterations=iterations,
+            phase=trainer.phase(trainer.iteration).name,
+            loss=math.nan,
+            psnr=math.nan,
+            gaussians=self.log.gaussians,
+            anchors=trainer.scene.scaffold.count,
+            seconds=0.0,
+            cpu_s=0.0,
+            events=tuple(event for event in self.log.events if event.iteration == iteration) if events else (),
+            iterations_per_s=0.0,
+            train_s=self.log.clock.train_s(),
+            evaluation=points[0] if points and points[0].iteration == iteration else None,
         )
 
 

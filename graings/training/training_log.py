@@ -17,7 +17,7 @@ from graings.document import Document
 from graings.evaluation.metrics import SplitMetrics
 from graings.plan.plan import Plan
 from graings.report.curve import curve_figure
-from graings.report.events import Event
+from graings.report.events import Event, Stiff
 from graings.report.figure_files import svg
 from graings.report.folder import report_training
 from graings.report.machine import machine_facts, version_facts
@@ -30,6 +30,7 @@ from graings.report.metrics_document import (
     ModelBytes,
     StiffnessFacts,
     config_hash,
+    read_metrics,
 )
 from graings.report.run_record import CaptureSource, RunRecord
 from graings.report.work_precision import run_names
@@ -54,12 +55,16 @@ class LogState(Document):
     curve: tuple[EvaluationPoint, ...]
     events: tuple[Event, ...]
     gaussians: int
+    plan: Plan
+    residual_unseen: int
 
 
 class TrainingLog:
     """The log of the run in `folder`.
 
-    `gaussians` is how many the last step drew; `diverged` is why training gave up, None while it has not.
+    `gaussians` is how many the last step drew; `diverged` is why training gave up, None while it has not. `plan` is
+    what training has made of the plan, and `residual_unseen` how many evaluations in a row found that the residual
+    does not show (`graings.training.plan_revision`).
     """
 
     def __init__(self, folder: Path, capture: Capture, config: TrainConfig, plan: Plan, clock: Clock) -> None:
@@ -72,6 +77,7 @@ class TrainingLog:
         self.curve: list[EvaluationPoint] = []
         self.events: list[Event] = []
         self.gaussians = 0
+        self.residual_unseen = 0
         self.diverged: str | None = None
         self._plotting_s = 0.0
 
@@ -109,6 +115,8 @@ class TrainingLog:
             curve=tuple(self.curve),
             events=tuple(self.events),
             gaussians=self.gaussians,
+            plan=self.plan,
+            residual_unseen=self.residual_unseen,
         ).to_json()
 
     def load(self, state: Mapping[str, Any]) -> None:
@@ -118,6 +126,21 @@ class TrainingLog:
         self.curve = list(values.curve)
         self.events = list(values.events)
         self.gaussians = values.gaussians
+        self.plan = values.plan
+        self.residual_unseen = values.residual_unseen
+
+    def is_complete(self, iterations: int) -> bool:
+        """Whether the metrics document is that of the last of all `iterations`."""
+        file = self.folder / METRICS_FILE
+        if not file.exists():
+            return False
+        document = read_metrics(file)
+        return document.iterations == iterations and bool(document.splits or not self.capture.val)
+
+    def forget_end(self, iteration: int) -> None:
+        """Take back what the end after the last `iteration` adds, so that it can be done again."""
+        self.curve = [point for point in self.curve if point.iteration < iteration]
+        self.events = [one for one in self.events if not (isinstance(one, Stiff) and one.iteration == iteration)]
 
     def write_run(self) -> None:
         """Write run.json: what is trained, on which capture and with which versions."""

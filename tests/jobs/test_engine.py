@@ -115,6 +115,36 @@ def test_a_job_can_be_cancelled_requeued_and_rewound_but_runs_under_its_own_limi
     assert most == 1
 
 
+@pytest.mark.slow(reason="waits for the polls of a queue")
+def test_a_job_that_is_taken_again_while_its_last_run_stops_is_at_work_until_both_end(engine: Engine) -> None:
+    began: list[int] = []
+    ended: list[int] = []
+    stop_first = False
+
+    async def run(_: str) -> Outcome:
+        began.append(number := len(began))
+        try:
+            await asyncio.Event().wait()
+        finally:
+            while number == 0 and not stop_first:  # its trainer writes a checkpoint
+                await asyncio.sleep(0.02)
+            ended.append(number)
+        raise AssertionError("unreachable: only cancellation ends the wait")
+
+    engine.enqueue("a", 10)
+    with executing(engine.url, "worker-a", 2, run, deliver, do_task) as at_work:
+        until(lambda: began == [0])
+        engine.cancel("a")
+        time.sleep(2.5)  # the run is cancelled within two seconds
+        engine.requeue(["a"])
+        until(lambda: began == [0, 1])
+        stop_first = True
+        until(lambda: ended == [0])
+        time.sleep(0.2)
+        assert at_work.ids() == {"a"}
+        assert state(engine, "a") is JobState.RUNNING
+
+
 def test_the_end_of_a_worker_stops_its_job_and_another_worker_can_take_it(engine: Engine) -> None:
     began = threading.Event()
 
@@ -187,11 +217,11 @@ def test_work_whose_end_cannot_be_recorded_is_known_and_can_be_put_back(
 
     with executing(engine.url, "worker-a", 1, run, deliver, run) as at_work:
         enqueue(engine)
-        until(lambda: runs == 1 and not at_work)
+        until(lambda: runs == 1 and not at_work.ids())
         time.sleep(1.0)
         refuse("drop trigger full")
         assert engine.taken() == {"a": "worker-a"}
         assert engine.taken("worker-b") == {}
         engine.put_back(engine.taken("worker-a"))
         until(lambda: state(engine, "a") is JobState.SUCCEEDED)
-        assert (runs, engine.taken(), at_work) == (2, {}, set())
+        assert (runs, engine.taken(), at_work.ids()) == (2, {}, frozenset())

@@ -7,17 +7,22 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 
 import pytest
 
 from graings.capture.synthetic import RECIPE_FILE, SceneRecipe, find_recipe
 from graings.config import make_config
 from graings.errors import CaptureError
+from jobs.capture_phase import Stopped, capture_of
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
-from jobs.progress import last_progress, read_progress
+from jobs.progress import ProgressWriter, last_progress, read_progress
 from jobs.store import JobFolder, Store
+
+SLOW_S = 5.0  # what a busy machine may take in addition
 
 
 def job(store: Store, recipe: SceneRecipe) -> JobFolder:
@@ -50,9 +55,45 @@ def test_a_job_that_ended_while_its_scene_was_drawn_draws_it_again_and_trains(
     reports = [report for _, report in read_progress(folder.progress, 0)[0]]
     assert list(dict.fromkeys(report.phase for report in reports))[:2] == ["capture", "loading"]
     assert {report.step for report in reports if report.phase == "capture"} == {"drawing"}
+    capture_s = [report.phase_s["capture"] for report in reports]
+    assert 0.0 < capture_s[0] <= capture_s[-1]
+    assert capture_s == sorted(capture_s)
     metrics = json.loads(folder.metrics.read_text())
     assert metrics["capture"]["frames"]["train"] == 100
     assert (folder.capture / "trajectories.json").is_file()  # the ground truth lies beside the images
+
+
+def test_the_seconds_of_the_capture_are_booked_as_such_by_all_attempts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = job(Store(tmp_path), SceneRecipe(scene="still", size=32, views=3))
+    upload, stop, progress = (
+        folder.path.parent.parent / "captures" / ("0" * 64),
+        Event(),
+        ProgressWriter(folder.progress),
+    )
+
+    def draw(*_: object, observe: Callable[[int, int], None], **__: object) -> None:
+        for done in (1, 2):
+            time.sleep(0.1)
+            observe(done, 3)
+        time.sleep(0.1)
+
+    monkeypatch.setattr("jobs.capture_phase.synthesize", draw)
+    stop.set()
+    phase_s = {"loading": 5.0, "capture": 10.0}  # of an attempt before
+    with pytest.raises(Stopped):
+        capture_of(upload, folder, 1, 12, phase_s, progress, stop)
+    last = last_progress(folder.progress)
+    assert last is not None
+    assert last.phase_s == phase_s
+    assert 10.1 <= last.phase_s["capture"] < 10.2 + SLOW_S
+    stop.clear()
+    before = time.monotonic()
+    capture_of(upload, folder, 1, 12, phase_s, progress, stop)
+    progress.close()
+    assert phase_s["loading"] == 5.0
+    assert last.phase_s["capture"] + 0.3 <= phase_s["capture"] <= last.phase_s["capture"] + time.monotonic() - before
 
 
 def test_a_recipe_is_the_only_file_of_its_folder(tmp_path: Path) -> None:

@@ -4,10 +4,13 @@ import os
 import shutil
 import stat
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
+from graings.storage.files import sync
 from graings.storage.locks import locked
 from jobs.exit_code import ExitCode
 from jobs.job import JobConflict, JobDamaged, JobNotFound, JobSpec
@@ -43,6 +46,34 @@ def test_a_job_on_a_video_is_trained_on_the_capture_that_was_made_of_it(tmp_path
     assert store.trained_on(job_id) == store.capture(DIGEST)
     store.folder(job_id).capture.mkdir()
     assert store.trained_on(job_id) == store.folder(job_id).capture
+
+
+@pytest.mark.parametrize("step", range(4))
+def test_a_submission_with_a_key_whose_process_died_makes_one_job_when_it_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """It dies after the job's record is written, after its link, after its folder is in place, and not at all."""
+
+    class Killed(BaseException):
+        pass
+
+    def dies(*_: object) -> None:
+        raise Killed
+
+    def dies_at(folder: Path) -> Callable[[Path], None]:
+        return lambda path: dies() if path == folder else sync(path)
+
+    store = Store(tmp_path)
+    with monkeypatch.context() as patch:
+        if step == 0:
+            patch.setattr(Path, "symlink_to", dies)
+        elif step < 3:
+            patch.setattr("jobs.store.sync", dies_at(tmp_path / ("submissions" if step == 1 else "jobs")))
+        with pytest.raises(Killed) if step < 3 else nullcontext():
+            store.create(spec(), unpacked(store, "u", "a.json"), "key")
+    jobs = {store.create(spec(), unpacked(store, name, "a.json"), "key") for name in ("v", "w")}
+    assert jobs == set(store.ids())
+    assert len(jobs) == 1
 
 
 def test_newer_jobs_come_first(tmp_path: Path) -> None:

@@ -116,9 +116,24 @@ def test_a_training_that_diverges_ends_with_a_model_and_a_last_report(tmp_path: 
     last = last_progress(folder.progress)
     assert last is not None
     assert (last.phase, last.iteration) == ("diverged", model.iteration)
+    assert last.phase_s["loading"] > 0.0
     reports, _ = read_progress(folder.progress, 0)
     kinds = [event.kind for _, report in reports for event in report.events]
     assert (kinds.count("rolled_back"), kinds.count("diverged"), kinds[-1]) == (3, 1, "diverged")
+
+
+def test_a_job_whose_trainer_was_killed_after_its_last_step_ends_with_a_report_of_that(tmp_path: Path) -> None:
+    folder = job(Store(tmp_path), {"iterations": 12})
+    for killed_before_metrics in (False, True, False):
+        if killed_before_metrics:
+            folder.metrics.unlink()
+        with trainer(folder) as process:
+            assert process.wait(60) == ExitCode.DONE
+        last = last_progress(folder.progress)
+        assert last is not None
+        assert (last.phase, last.iteration, last.iterations) == ("joint", 12, 12)
+        assert last.held_out_psnr is not None
+        assert last.anchors
 
 
 def test_an_extended_job_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:

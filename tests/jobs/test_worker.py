@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import sqlite3
@@ -17,12 +18,12 @@ import pytest
 from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
 from graings.storage.locks import locked
-from jobs.child_process import _lower_priority
+from jobs.child_process import ChildProcess, ProcessExit, _lower_priority
 from jobs.commands import TRAINING_NICE
 from jobs.exit_code import ExitCode
-from jobs.job import Attempt, JobConflict, JobSpec, JobState
+from jobs.job import Attempt, JobConflict, JobError, JobSpec, JobState
 from jobs.queue import JobQueue
-from jobs.worker import MAX_CRASHES, MAX_WORKER_DEATHS, give_up_reason
+from jobs.worker import MAX_CRASHES, MAX_WORKER_DEATHS, Worker, give_up_reason
 
 LONG_S = 120.0
 # Long enough to be interrupted, with a checkpoint every 20 iterations.
@@ -178,6 +179,47 @@ def test_a_job_whose_end_could_not_be_recorded_ends_once_it_can_be(jobs: JobQueu
         change("drop trigger full")
         assert jobs.get(job_id).state is JobState.RUNNING
         until(lambda: jobs.get(job_id).state is JobState.SUCCEEDED)
+
+
+SLEEP = "import time; time.sleep(60)"
+DEAF = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {SLEEP}"
+
+
+@pytest.mark.parametrize(("statement", "code"), [(SLEEP, -signal.SIGTERM), (DEAF, -signal.SIGKILL)])
+def test_a_stop_that_ends_the_trainer_by_a_signal_is_no_crash(
+    jobs: JobQueue, monkeypatch: pytest.MonkeyPatch, statement: str, code: int
+) -> None:
+    """It may be importing, or be busy for longer than its grace time."""
+    unpacked = jobs.store.uploads / "u"
+    unpacked.mkdir()
+    (unpacked / "a.json").write_text("")
+    folder = jobs.store.folder(jobs.submit(JobSpec("job", "0" * 64, {}), unpacked).id)
+    worker = Worker(jobs.store, "")
+    worker._queue = jobs
+    endings: list[int] = []
+
+    class Trainer(ChildProcess):
+        async def run(self) -> ProcessExit:
+            ending = await super().run()
+            endings.append(ending.code)
+            return ending
+
+    def child(*_: object) -> ChildProcess:
+        return Trainer(["timeit", "-n", "1", "-r", "1", statement], folder.log, grace_s=0.1)
+
+    async def stop_while_it_works() -> None:
+        work = asyncio.create_task(worker._work(folder.path.name))
+        await asyncio.sleep(1.0 if statement is SLEEP else 3.0)
+        worker._trainers[folder.path.name].stop()
+        with pytest.raises(JobError, match="was taken from worker"):
+            await work
+
+    monkeypatch.setattr(worker, "_child", child)
+    for _ in range(MAX_CRASHES + 1):
+        asyncio.run(stop_while_it_works())
+    assert endings == [code] * (MAX_CRASHES + 1)
+    assert {attempt.exit_code for attempt in folder.attempts()} == {ExitCode.STOPPED}
+    assert give_up_reason(folder.attempts(), 0) is None
 
 
 def attempts(*exit_codes: int | None, checkpoint: int = 0, final: bool = False) -> list[Attempt]:

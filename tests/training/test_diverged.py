@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 
+from graings.cli.training import where_it_goes_on
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation.evaluate import evaluate
 from graings.render import render
@@ -130,6 +131,35 @@ def test_a_run_with_skipped_steps_resumes_bit_for_bit(
     assert facts == found[1][0][1]
     assert all(torch.equal(norms[name], found[1][0][0][name]) for name in norms)
     assert all(torch.equal(scene[name], found[1][1][name]) for name in scene)
+
+
+@pytest.mark.parametrize(
+    ("options", "earlier", "kept"),
+    [
+        ({}, 5, ["00000005"]),
+        ({"guard.skip_only": True}, 5, ["00000010", "00000012"]),  # such a run never rolls back
+        ({}, None, ["00000010"]),  # better than none
+    ],
+    ids=str,
+)
+def test_a_diverging_scene_is_not_saved_so_that_a_resumed_run_returns_to_a_healthy_one(
+    micro: Path, tmp_path: Path, options: dict[str, object], earlier: int | None, kept: list[str]
+) -> None:
+    folder = tmp_path / "run"
+    run = TrainingRun.create(micro, folder, micro_config(**{"evaluation.checkpoint_every": 10} | options))
+    for report in run:
+        if report.iteration == earlier:
+            run.save()
+        if report.iteration == 5:
+            run.trainer.guard.trend.mean = 1e3  # and falls by 2 % a step at most
+            run.trainer.guard.trend._count = 1_000
+        if report.iteration == 12:
+            break
+    assert run.save().name == kept[-1]
+    assert [one.name for one in checkpoints(folder)] == kept
+    where = f"iteration {int(kept[-1])}," if int(kept[-1]) < 12 else "at a checkpoint"
+    assert where in where_it_goes_on(run)
+    assert TrainingRun.resume(folder, threads=1).iteration == int(kept[-1])
 
 
 def test_a_scene_that_is_not_finite_is_never_saved(micro: Path, tmp_path: Path) -> None:

@@ -15,13 +15,16 @@ from graings.plan.plan import make_plan
 from graings.plan.rules import QUIET_GROWTHS
 from graings.plan.tile_change import HALF_LEVEL
 from graings.render import render
-from graings.report.events import GrowthQuiet, PartDropped
+from graings.report.events import GrowthQuiet, PartDropped, Restarted
 from graings.report.metrics_document import read_metrics
 from graings.report.run_record import read_plan
 from graings.scene.scene import Scene
 from graings.storage.checkpoint import load_model
+from graings.training.curriculum import missing_motion
+from graings.training.curriculum.missing_motion import MissingMotion
 from graings.training.residual_bound import residual_bound
 from graings.training.run import TrainingRun
+from graings.training.timing import evaluation_marks
 from graings.training.trainer import Trainer
 from graings.training.view_dependence import view_dependence
 from tests.capture.captures import entry, orbit, write_image, write_transforms
@@ -35,6 +38,11 @@ OFTEN = {"evaluation.first": 10, "evaluation.factor": 1.2, "iterations": 100, "p
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_synthetic(tmp_path_factory.mktemp("capture") / "tiny", seed=1, frames=8, size=24, bodies=2)
+
+
+def dropped_at(run: Path) -> list[int]:
+    events = read_metrics(run / "metrics.json").events
+    return [event.iteration for event in events if isinstance(event, PartDropped)]
 
 
 def parameters(scene: Scene) -> dict[str, torch.Tensor]:
@@ -153,6 +161,80 @@ def test_a_run_resumed_after_the_residual_went_has_the_same_bits(capture: Path, 
     assert plan.drops("residual")
 
 
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_run_interrupted_between_two_evaluations_leaves_the_residual_out_when_the_unbroken_one_does(
+    capture: Path, tmp_path: Path, killed: bool
+) -> None:
+    """Stopped after the first that found it below the bound, or killed after the second, before its checkpoint."""
+    config = micro_config(**OFTEN, **FROZEN)
+    list(TrainingRun.create(capture, tmp_path / "whole", config))
+    (dropped,) = dropped_at(tmp_path / "whole")
+    run = TrainingRun.create(capture, tmp_path / "parts", config)
+    for report in run:
+        if report.iteration == dropped - 1:
+            assert run.log.residual_unseen == 1
+            run.save()
+        if report.iteration == dropped - 1 + 2 * killed:
+            break
+    resumed = TrainingRun.resume(tmp_path / "parts")
+    assert not resumed.revision.plan.drops("residual")
+    steps_left = iter(resumed)
+    next(steps_left)
+    assert resumed.revision.plan.drops("residual")
+    assert resumed.trainer.scene.residual is None
+    list(steps_left)
+    assert dropped_at(tmp_path / "parts") == [dropped]
+    whole, parts = (parameters(load_model(tmp_path / name).scene) for name in ("whole", "parts"))
+    assert whole.keys() == parts.keys()
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    plans = [read_plan(tmp_path / name) for name in ("whole", "parts")]
+    decisions = [[d.model_dump(exclude={"saving"}) for d in plan.decisions] for plan in plans if plan is not None]
+    assert decisions[0] == decisions[1]
+
+
+def test_the_plan_on_disk_is_that_of_the_checkpoint_once_a_killed_run_goes_on(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", micro_config(**OFTEN, **FROZEN))
+    for report in run:
+        if report.iteration == 1:
+            run.save()
+        if any(isinstance(event, PartDropped) for event in report.events):
+            break
+    plan = read_plan(tmp_path / "run")
+    assert plan is not None
+    assert plan.drops("residual")
+    next(iter(TrainingRun.resume(tmp_path / "run")))
+    plan = read_plan(tmp_path / "run")
+    assert plan is not None
+    assert not plan.drops("residual")
+
+
+def test_a_restart_judges_the_residual_of_the_new_scene_anew(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(missing_motion, "MIN_STEPS", 1)
+    monkeypatch.setattr(MissingMotion, "find", lambda *_: MissingMotion(0.5, 0.5))
+    run = TrainingRun.create(capture, tmp_path / "run", micro_config(**OFTEN, **FROZEN))
+    for report in run:
+        if any(isinstance(event, Restarted) for event in report.events):
+            break
+    restart = run.iteration
+    (first,) = [event.iteration for event in run.log.events if isinstance(event, PartDropped)]
+    assert first < restart
+    plan = read_plan(tmp_path / "run")
+    assert plan == run.revision.plan
+    decision = run.revision.plan.decision("residual")
+    assert decision is not None
+    assert decision.decision == "later"
+    assert decision.iteration is not None
+    assert decision.iteration < first
+    run.save()
+    list(TrainingRun.resume(tmp_path / "run"))
+    judged = [mark - restart for mark in sorted(evaluation_marks(run.config, run.iterations)) if mark > restart]
+    second = [mark for mark in judged if mark >= decision.iteration][1]  # two evaluations of the new scene
+    assert dropped_at(tmp_path / "run") == [first, restart + second]
+    assert load_model(tmp_path / "run").scene.residual is None
+
+
 @pytest.mark.parametrize("left_out", [{"scene.deformation": "none"}, {"scene.residual": False}], ids=str)
 def test_the_warm_up_has_the_same_bits_without_a_part_of_the_joint_phase(
     capture: Path, left_out: dict[str, object]
@@ -215,6 +297,22 @@ def test_growth_ends_where_nothing_grows_if_aggressive(capture: Path, mode: str,
 def test_growth_goes_on_where_something_grows_or_it_is_to_be_kept(capture: Path) -> None:
     assert growth_events(micro_trainer(capture, **{**QUIET, "density.gradient_threshold": 1e-9})) == []
     assert growth_events(micro_trainer(capture, **{**QUIET, "plan.keep": ["growth"]})) == []
+
+
+def test_a_run_stopped_after_its_growth_went_quiet_says_so_in_its_plan(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", micro_config(**QUIET))
+    for report in run:
+        quiet = [event for event in report.events if isinstance(event, GrowthQuiet)]
+        if quiet:
+            break
+    run.save()
+    before = read_plan(tmp_path / "run")
+    list(TrainingRun.resume(tmp_path / "run"))
+    for plan in (before, read_plan(tmp_path / "run"), read_metrics(tmp_path / "run" / "metrics.json").plan):
+        assert plan is not None
+        decision = plan.decision("growth")
+        assert decision is not None
+        assert (decision.decision, decision.iteration) == ("drop", quiet[0].iteration)
 
 
 def test_a_budget_that_is_used_up_does_not_count_as_nothing_to_grow(capture: Path) -> None:

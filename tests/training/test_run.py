@@ -21,11 +21,14 @@ from graings.errors import CaptureError, CheckpointError
 from graings.raster.photometric import photometric
 from graings.render import low_pass
 from graings.report.evaluate_run import evaluate_run
+from graings.report.events import Stiff
 from graings.report.machine import version_facts
 from graings.report.metrics_document import read_metrics
 from graings.report.run_record import read_record
 from graings.storage.checkpoint import load_model, newest_checkpoint
 from graings.storage.compact import open_model
+from graings.storage.run_folder import LOCK_FILE
+from graings.training.guard.stiffness import Stiffness
 from graings.training.held_out import HeldOut
 from graings.training.run import TrainingRun
 from tests.capture.captures import write_image
@@ -223,15 +226,41 @@ def test_a_resumed_run_keeps_its_options(capture: Path, tmp_path: Path) -> None:
     assert TrainingRun.resume(tmp_path / "run").config == config
 
 
-def test_a_run_cut_off_before_its_metrics_writes_them_when_resumed(capture: Path, tmp_path: Path) -> None:
-    list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=20)))
+def test_a_run_cut_off_before_its_metrics_ends_as_the_unbroken_one_when_resumed(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Stiffness, "events", lambda _, iteration: (Stiff(iteration=iteration, step_over_size=2.0),))
+    *_, reported = TrainingRun.create(capture, tmp_path / "run", _config(iterations=20))
     metrics = tmp_path / "run" / "metrics.json"
     expected = json.loads(metrics.read_text())
     metrics.unlink()
-    assert list(TrainingRun.resume(tmp_path / "run", threads=1)) == []
+    (again,) = TrainingRun.resume(tmp_path / "run", threads=1)
     found = json.loads(metrics.read_text())
     assert found["splits"]["val"] == expected["splits"]["val"]
     assert (found["gaussians"], found["iterations"]) == (expected["gaussians"], 20)
+    assert [point["psnr"] for point in found["curve"]] == [point["psnr"] for point in expected["curve"]]
+    assert found["events"] == expected["events"]
+    assert "stiff" in {event.kind for event in again.events}
+    for report in (again, reported):
+        assert (report.iteration, report.iterations, report.phase) == (20, 20, "joint")
+        assert (report.gaussians, report.anchors) == (expected["gaussians"], expected["anchors"])
+    assert set(again.events) == set(reported.events)
+    assert again.evaluation is not None
+    assert reported.evaluation is not None
+    assert again.evaluation.psnr == reported.evaluation.psnr
+
+
+def test_a_complete_run_that_is_resumed_reports_its_end_and_changes_nothing(unbroken: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(unbroken, folder)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    (report,) = TrainingRun.resume(folder, threads=1)
+    assert (report.iteration, report.iterations, report.events) == (ITERATIONS, ITERATIONS, ())
+    assert report.evaluation == read_metrics(folder / "metrics.json").curve[-1]
+    after = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert {path: content for path, content in after.items() if path.name != LOCK_FILE} == {
+        path: content for path, content in before.items() if path.name != LOCK_FILE
+    }
 
 
 def test_only_the_last_two_checkpoints_and_the_best_are_kept(capture: Path, tmp_path: Path) -> None:

@@ -96,6 +96,11 @@ class Guard:
         return None if self.config.skip_only else self.trend.problem()
 
     @property
+    def diverging(self) -> bool:
+        """Whether the loss is far above its best, so that training may have to roll back."""
+        return not self.config.skip_only and not self.trend.healthy
+
+    @property
     def may_roll_back(self) -> bool:
         """Whether another return to a snapshot is allowed."""
         return not self.config.skip_only and self.rollbacks < self.config.rollbacks
