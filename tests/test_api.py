@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import graings
+from graings.config import TrainConfig, make_config
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "python.md"
 
@@ -81,5 +82,41 @@ def test_a_wrong_parameter_is_named(tmp_path: Path) -> None:
         graings.open_scene(tmp_path / "nothing")
     with pytest.raises(ValueError, match="six numbers"):
         graings.export_model(tmp_path, tmp_path / "a.ply", box=(0, 1, 2))
+    with pytest.raises(ValueError, match=r"frames is not used by a \.ply file"):
+        graings.export_model(tmp_path, tmp_path / "a.ply", frames=3)
+    with pytest.raises(graings.GraingsError, match="there is no folder"):
+        graings.export_model(tmp_path, tmp_path / "none" / "a.ply")
     with pytest.raises(ValueError, match=r"a \.graings file holds the whole scene"):
         graings.export_model(tmp_path, tmp_path / "a.graings", seen=True)
+
+
+@pytest.mark.parametrize(
+    ("preset", "options", "trained"),
+    [
+        (None, None, "standard"),
+        (None, {"preset": "fine"}, "fine"),
+        ("draft", None, "draft"),
+        ("draft", {"seed": 1}, "draft"),
+        ("fine", {"preset": "fine"}, "fine"),
+    ],
+)
+def test_the_preset_is_a_parameter_or_an_option(
+    preset: str | None, options: dict[str, object] | None, trained: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Stopped(Exception):
+        pass
+
+    def create(capture: Path, run: Path, config: TrainConfig) -> None:
+        assert config.preset == trained
+        assert config == make_config(trained, {**(options or {}), "preset": trained})
+        raise Stopped
+
+    monkeypatch.setattr(graings.TrainingRun, "create", create)
+    with pytest.raises(Stopped):
+        graings.train(tmp_path, tmp_path / "run", preset=preset, options=options)
+
+
+def test_two_presets_are_refused_by_their_names(tmp_path: Path) -> None:
+    with pytest.raises(graings.GraingsError, match="preset: is draft, and in options fine"):
+        graings.train(tmp_path, tmp_path / "run", preset="draft", options={"preset": "fine"})
+    assert not (tmp_path / "run").exists()

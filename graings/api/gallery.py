@@ -14,7 +14,7 @@ from graings.capture.synthetic import SUITE
 from graings.errors import CheckpointError
 from graings.report.metrics_document import Metrics, read_metrics
 from graings.report.run_record import read_record
-from graings.storage.run_folder import METRICS_FILE
+from graings.storage.run_folder import METRICS_FILE, newest_model
 
 SIDE: Final = 320  # px of stills and clips
 SECONDS: Final = 4.0
@@ -70,29 +70,40 @@ def write_gallery(
     """Write the page and its files into `folder` and return the page; `observe` gets frames done and frames in all.
 
     Clips are WebP and need the extra [video]; each run is named after its folder. What is already there is replaced.
-    Raises `ValueError` for two runs of one name, and `CheckpointError` for a folder that holds no finished run.
+    Raises `ValueError` for two runs of one name and for one whose page would be that of the gallery, and
+    `CheckpointError` for a folder that holds no finished run. All runs are looked at before anything is rendered.
     """
     names = [run.resolve().name for run in runs]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"runs are named after their folders, and several are {', '.join(twice)}; rename one")
+    if Path(PAGE_FILE).stem in names:
+        raise ValueError(f"runs are named after their folders, and {PAGE_FILE} is the gallery's page; rename that run")
+    finished = [_finished(run) for run in runs]
     folder.mkdir(parents=True, exist_ok=True)
     per_clip, items = round(SECONDS * FPS), []
-    for index, (run, name) in enumerate(zip(runs, names, strict=True)):
-        metrics = read_metrics(run / METRICS_FILE)
-        if metrics.iterations < metrics.iterations_planned:
-            raise CheckpointError(f"{run}: is not finished. Continue it (graings train --resume -o {run}).")
-        before = index * per_clip
-        items.append(_item(run, name, metrics, folder, partial(_count, observe, before, len(runs) * per_clip)))
+    for index, (run, name, (metrics, capture)) in enumerate(zip(runs, names, finished, strict=True)):
+        counted = partial(_count, observe, index * per_clip, len(runs) * per_clip)
+        items.append(_item(run, name, metrics, capture, folder, counted))
     page = folder / PAGE_FILE
     page.write_text(_PAGE.format(title=html.escape(title), items="".join(items)), encoding="utf-8")
     return page
+
+
+def _finished(run: Path) -> tuple[Metrics, str]:
+    """The metrics of a run that has ended and has a model, and the name of its capture. Raises `CheckpointError`."""
+    metrics = read_metrics(run / METRICS_FILE)
+    if metrics.iterations < metrics.iterations_planned:
+        raise CheckpointError(f"{run}: is not finished. Continue it (graings train --resume -o {run}).")
+    if newest_model(run) is None:
+        raise CheckpointError(f"{run}: has no model. Leave it out, or train it again.")
+    return metrics, read_record(run).capture.path.name
 
 
 def _count(observe: Callable[[int, int], None], before: int, total: int, done: int) -> None:
     observe(before + done, total)
 
 
-def _item(run: Path, name: str, metrics: Metrics, folder: Path, observe: Callable[[int], None]) -> str:
+def _item(run: Path, name: str, metrics: Metrics, capture: str, folder: Path, observe: Callable[[int], None]) -> str:
     scene = open_scene(run)
     view: dict[str, Any] = {"width": SIDE, "height": SIDE}
     save_image(folder / f"{name}.png", render_view(scene, t=0.5, **view))
@@ -100,8 +111,10 @@ def _item(run: Path, name: str, metrics: Metrics, folder: Path, observe: Callabl
     render_video(scene, clip, seconds=SECONDS, fps=FPS, observe=observe, **view)
     export_model(run, folder / f"{name}.html")
     questions = {entry.name: entry.question for entry in SUITE}
-    about = questions.get(read_record(run).capture.path.name, f"{metrics.gaussians:,} Gaussians")
-    found = [f"{split} {metrics.splits[split].psnr:.2f} dB" for split in ("val", "test") if split in metrics.splits]
+    about = questions.get(capture, f"{metrics.gaussians:,} Gaussians")
+    # The PSNR of a split without images is None.
+    measured = [(split, metrics.splits[split].psnr) for split in ("val", "test") if split in metrics.splits]
+    found = [f"{split} {psnr:.2f} dB" for split, psnr in measured if psnr is not None]
     size = (folder / f"{name}.html").stat().st_size
     numbers = [*found, f"{metrics.train_cpu_s / 60:.0f} min of CPU time", f"player with scene {size / 1e6:.1f} MB"]
     return _ITEM.format(

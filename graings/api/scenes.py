@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from graings.api.training import FilePath
 from graings.camera.view_request import ViewRequest
 from graings.export.camera_path import Moves, frames_of
-from graings.export.export import FRAMES
 from graings.export.selection import Selection
 from graings.export.shown import Shown, open_shown
 from graings.export.video import check_video, write_video
@@ -68,7 +67,7 @@ def render_video(
     `render_view`. Raises `ValueError`, and `CheckpointError` for the file.
     """
     path, request = Path(path), _request(view)
-    check_video(path)
+    check_video(path, fps)
     _, _, background = request.resolve(scene.views, scene.units, scene.background)
     frames = frames_of(scene, request, along, moves, max(1, round(seconds * fps)))
     write_video(path, scene, frames, background, fps=fps, observe=observe)
@@ -78,8 +77,8 @@ def export_model(
     run: FilePath,
     path: FilePath,
     *,
-    t: float = 0.0,
-    frames: int = FRAMES,
+    t: float | None = None,
+    frames: int | None = None,
     degree: int | None = None,
     box: Sequence[float] | None = None,
     sphere: Sequence[float] | None = None,
@@ -87,9 +86,9 @@ def export_model(
 ) -> str:
     """Write a model in the format that the suffix of `path` names; returns a line on its size and content.
 
-    With all times: .graings, .html, .scene.gz. At the time `t`: .ply, .compressed.ply, .spz, .sog, .splat, .glb. At
-    `frames` times: .zip, .4dgs. `degree`, `box`, `sphere` and `seen`: as for `graings export`. Raises `ValueError`, and
-    `CheckpointError` for the model.
+    With all times: .graings, .html, .scene.gz. At the time `t` (default 0): .ply, .compressed.ply, .spz, .sog, .splat,
+    .glb. At `frames` times (default 30): .zip, .4dgs. `degree`, `box`, `sphere` and `seen`: as for `graings export`.
+    Raises `ValueError`, also for what the format does not use, and `CheckpointError` for the model and the file.
     """
     selection = Selection(None if box is None else tuple(box), None if sphere is None else tuple(sphere), seen)
     request = export_request(Path(path), time=t, frames=frames, degree=degree, selection=selection)

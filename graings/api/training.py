@@ -11,6 +11,7 @@ from graings.capture.capture import Capture, Split
 from graings.capture.load import load_capture as read_capture
 from graings.capture.synthetic import synthesize as write_scene
 from graings.config import CaptureConfig, make_config
+from graings.errors import ConfigError
 from graings.evaluation.metrics import SplitMetrics
 from graings.kernel.threads import usable_cores
 from graings.report.evaluate_run import evaluate_run as evaluate_and_record
@@ -38,17 +39,23 @@ def train(
     capture: FilePath,
     run: FilePath,
     *,
-    preset: str = "standard",
+    preset: str | None = None,
     options: Mapping[str, Any] | None = None,
     observe: Callable[[RunReport], None] = lambda step: None,
 ) -> Path:
     """Train on the capture and write the model, metrics and plots into the folder `run`, which is returned.
 
-    `options` are those of `graings options`, such as `{"iterations": 500, "capture.max_side": 400}`. `observe` is
-    called after every iteration. A program that wants to stop and resume iterates over a `TrainingRun` itself. Raises
-    `CaptureError`, `ConfigError`, `CheckpointError` where `run` holds a run already, and `DivergedError`.
+    `options` are those of `graings options`, such as `{"iterations": 500, "capture.max_side": 400}`. The preset may be
+    one of them; by default it is `standard`. `observe` is called after every iteration. A program that wants to stop
+    and resume iterates over a `TrainingRun` itself. Raises `CaptureError`, `ConfigError`, `CheckpointError` where `run`
+    holds a run already, and `DivergedError`.
     """
-    config = make_config(overrides={**(options or {}), "preset": preset})
+    overrides = dict(options or {})
+    if preset is not None:
+        if overrides.get("preset", preset) != preset:
+            raise ConfigError(f"preset: is {preset}, and in options {overrides['preset']}. Give one of them.")
+        overrides["preset"] = preset
+    config = make_config(overrides=overrides)
     training = TrainingRun.create(Path(capture), Path(run), config)
     for step in training:
         observe(step)

@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable
 from importlib.metadata import entry_points, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -26,6 +27,12 @@ Verdict = Literal["ok", "missing", "broken"]
 Check = tuple[str, Verdict, str]
 
 MIN_FREE_GB: Final = 2.0
+# Packages of extras: the name of the extra, and what they are for.
+OPTIONAL: Final = {
+    "av": ("video", "videos, and captures from videos"),
+    "gaussforge": ("splats", "files of splats: .compressed.ply, .spz, .sog, .splat, .ksplat"),
+    "fourdgs": ("splats", ".4dgs files"),
+}
 COLORS: Final = {"ok": "green", "missing": "yellow", "broken": "red"}
 
 
@@ -70,6 +77,11 @@ def _extras() -> Iterable[Check]:
         yield "pycolmap", "ok", f"{pycolmap.__version__}: lens distortion and triangulation"
     except ImportError:
         yield "pycolmap", "missing", "no lens distortion, no triangulation: pip install 'graings[colmap]'"
+    for package, (extra, use) in OPTIONAL.items():
+        if find_spec(package) is None:
+            yield package, "missing", f"no {use}: pip install 'graings[{extra}]'"
+        else:
+            yield package, "ok", f"{version(package)}: {use}"
     distances = PerceptualDistances.find()
     for name, metric in (("LPIPS", distances.lpips), ("FLIP", distances.flip)):
         yield name, "missing" if metric.reason else "ok", metric.reason or "can be measured"

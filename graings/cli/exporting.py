@@ -30,8 +30,10 @@ def export(
             "or .glb; .zip, a sequence of PLY files; .4dgs, pieces of straight motion.",
         ),
     ],
-    time: Annotated[float, typer.Option("--time", "--t", help="Time from 0 to 1 of the splats.")] = 0.0,
-    frames: Annotated[int, typer.Option(help="Number of times in a .zip or .4dgs.")] = FRAMES,
+    time: Annotated[
+        float | None, typer.Option("--time", "--t", help="Time from 0 to 1 of the splats (default: 0).")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(help=f"Number of times in a .zip or .4dgs (default: {FRAMES}).")] = None,
     degree: Annotated[
         int | None,
         typer.Option(min=0, max=3, help="Degree of the spherical harmonics of colour (default: what the scene needs)."),

@@ -14,7 +14,7 @@ from graings.cli.terminal import print_line
 from graings.cli.training import Threads
 from graings.evaluation.metrics import psnr
 from graings.export.picture import Content, check_content, picture
-from graings.export.shown import UP, open_shown
+from graings.export.shown import open_shown
 from graings.image_encoding import image_format
 from graings.kernel import use_threads
 from graings.render import FastScene, PreparedScene, render
@@ -70,8 +70,9 @@ def render_view(
         ),
     ] = False,
     up: Annotated[
-        tuple[float, float, float], typer.Option(metavar="X Y Z", help="Vertical axis of a file of splats.")
-    ] = UP,
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Vertical axis of a file of splats (default: 0 -1 0)."),
+    ] = None,
     threads: Threads = None,
 ) -> None:
     """Render one view at one time; without --camera or --pose, an orbit around the scene."""

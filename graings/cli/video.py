@@ -13,8 +13,8 @@ from graings.cli.rendering import RenderPath
 from graings.cli.terminal import print_line, task_progress
 from graings.cli.training import Threads
 from graings.export.camera_path import Moves, frames_of
-from graings.export.shown import UP, open_shown
-from graings.export.video import check_video, write_video
+from graings.export.shown import open_shown
+from graings.export.video import FPS, check_video, video_size, write_video
 from graings.export.video_parts import FRAMES
 from graings.kernel import use_threads
 
@@ -33,7 +33,7 @@ def video(
         ),
     ] = None,
     seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="Length.")] = 4.0,
-    fps: Annotated[float, typer.Option(min=0.1, max=240, help="Frames per second.")] = 30.0,
+    fps: Annotated[float, typer.Option(min=0.1, max=FPS, help="Frames per second; at most 100 in a .gif.")] = 30.0,
     t: Annotated[float | None, typer.Option(help="Time from 0 to 1 while only the camera moves (default: 0).")] = None,
     camera: Annotated[
         str | None, typer.Option(help="A view of the capture for a fixed camera, such as test:3.")
@@ -51,13 +51,16 @@ def video(
     background: Annotated[
         str | None, typer.Option(help="white, black, #rrggbb or r,g,b (default: as in training).")
     ] = None,
-    up: Annotated[tuple[float, float, float], typer.Option(metavar="X Y Z", help="Vertical of a file of splats.")] = UP,
+    up: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Vertical axis of a file of splats (default: 0 -1 0)."),
+    ] = None,
     threads: Threads = None,
 ) -> None:
     """Render a video: time runs, the camera moves, or both."""
     use_threads(threads)
     try:
-        check_video(output)
+        check_video(output, fps)
         request = ViewRequest(
             camera=camera,
             azimuth=azimuth,
@@ -73,6 +76,7 @@ def video(
         shown = open_shown(run, up)
         _, _, rgb = request.resolve(shown.views, shown.units, shown.background)
         frames = frames_of(shown, request, path, moves, max(1, round(seconds * fps)))
+        width, height = video_size(output, frames[0][0])
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
     started = perf_counter()
@@ -86,6 +90,7 @@ def video(
             print_line(f"Interrupted. The same command goes on where it was, to {FRAMES} frames.")
             raise
     elapsed = perf_counter() - started
-    size = f"{frames[0][0].width} x {frames[0][0].height}"
     kept = "" if rendered == len(frames) else f" ({len(frames) - rendered} of them were there)"
-    print_line(f"{output}: {len(frames)} frames{kept}, {size}, {rendered / elapsed:.1f} frames per second to make.")
+    print_line(
+        f"{output}: {len(frames)} frames{kept}, {width} x {height}, {rendered / elapsed:.1f} frames per second to make."
+    )

@@ -36,14 +36,17 @@ class Shown:
     digest: str
 
 
-def open_shown(path: Path, up: Sequence[float] = UP) -> Shown:
-    """The model in a run, checkpoint or .graings file, or the splats in a file, whose vertical axis is `up`.
+def open_shown(path: Path, up: Sequence[float] | None = None) -> Shown:
+    """The model in a run, checkpoint or .graings file, or the splats in a file, whose vertical axis is `up` (or `UP`).
 
-    Raises `CheckpointError`, and `ValueError` for an axis of length 0.
+    Raises `CheckpointError`, and `ValueError` for an axis of length 0 or that of a model, which has its own.
     """
     if not path.is_file() or suffix_of(path, READABLE) is None:
+        if up is not None:
+            raise ValueError(f"up is for files of splats, and {path} is none: a model knows its vertical; leave it out")
         model = open_model(path)
         return Shown(PreparedScene(model.scene), model.units, model.views, model.background, model.digest)
+    up = UP if up is None else up
     length = math.hypot(*up)
     if not (math.isfinite(length) and length > 0):
         raise ValueError(f"up must be three finite numbers, not all 0, got {tuple(up)}")

@@ -14,18 +14,37 @@ import numpy as np
 
 from graings.camera.camera import Camera
 from graings.export.shown import Shown
-from graings.export.video_file import CODECS, encoder_version, video_file
+from graings.export.video_file import CODECS, MAX_FPS, encoder_version, video_file
 from graings.export.video_parts import open_parts
 from graings.render import render
 
 FORMATS: Final = (".mp4", ".webm", ".webp", ".gif")
+FPS: Final = 240.0  # most frames per second
 
 
-def check_video(path: Path) -> None:
-    """Raises `ValueError` for a suffix that is not written."""
-    if path.suffix.lower() not in ("", *FORMATS):
+def check_video(path: Path, fps: float) -> None:
+    """Raises `ValueError` for a suffix that is not written, and for a rate that its format does not have."""
+    suffix = path.suffix.lower()
+    if suffix not in ("", *FORMATS):
         known = f"{', '.join(FORMATS)}, or no suffix: a folder of PNG files"
         raise ValueError(f"{path.name}: videos of this kind are not written, choose one of {known}")
+    most = MAX_FPS.get(suffix, FPS)
+    if not 0 < fps <= most:
+        of = f" for a {suffix} file" if suffix in MAX_FPS else ""
+        raise ValueError(f"fps must lie in (0, {most:g}]{of}, got {fps:g}")
+
+
+def video_size(path: Path, camera: Camera) -> tuple[int, int]:
+    """Width and height in px of the video `path` of what `camera` sees.
+
+    Codecs with subsampled colour need even sides: an odd one loses a pixel. Raises `ValueError` where none is left.
+    """
+    codec = CODECS.get(path.suffix.lower())
+    even = codec is not None and codec.pixels == "yuv420p"
+    width, height = (side - side % 2 if even else side for side in (camera.width, camera.height))
+    if min(width, height) < 1:
+        raise ValueError(f"{path.suffix} needs at least 2 x 2 pixels")
+    return width, height
 
 
 def write_video(
@@ -41,18 +60,12 @@ def write_video(
 
     `observe` is called with the number of frames that are done. An existing file is replaced when the video is whole.
     A call that was interrupted goes on where it was when it is repeated (`graings.export.video_parts`); returned is how
-    many frames were rendered by this call. Codecs with subsampled colour need even sides: an odd one loses a pixel.
+    many frames were rendered by this call. All frames have the size `video_size` of the first.
     Raises `ValueError` for a rate out of range, `CheckpointError` where PyAV is missing, an encoder fails, or another
     process makes this video.
     """
-    check_video(path)
-    if not 0 < fps <= 240:
-        raise ValueError(f"fps must lie in (0, 240], got {fps}")
-    codec = CODECS.get(path.suffix.lower())
-    even = codec is not None and codec.pixels == "yuv420p"
-    width, height = (side - side % 2 if even else side for side in (frames[0][0].width, frames[0][0].height))
-    if min(width, height) < 1:
-        raise ValueError(f"{path.suffix} needs at least 2 x 2 pixels")
+    check_video(path, fps)
+    width, height = video_size(path, frames[0][0])
     frames = [(camera.resized(width, height), time) for camera, time in frames]
     identity = _identity(frames, (encoder_version(path), shown.digest, *background, fps))
     rendered = 0

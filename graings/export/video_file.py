@@ -41,6 +41,8 @@ CODECS: Final = {
     ".mkv": Codec("libx264rgb", "rgb24", {"qp": "0", "preset": "ultrafast"}, {}),  # lossless
 }
 
+MAX_FPS: Final = {".gif": 100.0}  # GIF counts hundredths of a second
+
 Levels = NDArray[np.uint8]
 AddFrame = Callable[[Levels], None]
 

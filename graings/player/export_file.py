@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
+from graings.errors import CheckpointError
 from graings.export.export import (
     FRAMES,
     MODEL,
@@ -11,6 +13,7 @@ from graings.export.export import (
     SEVERAL,
     WHOLE,
     ExportRequest,
+    check_used,
     export_format,
     export_splats,
 )
@@ -26,27 +29,44 @@ from graings.storage.model import scene_bytes as model_bytes
 def export_request(
     path: Path,
     *,
-    time: float = 0.0,
-    frames: int = FRAMES,
+    time: float | None = None,
+    frames: int | None = None,
     degree: int | None = None,
     selection: Selection | None = None,
 ) -> ExportRequest | None:
     """The request of splats in a file named `path`; None for a format with the whole scene.
 
-    Raises `ValueError` for a suffix that is not written, values out of range, and a selection from a whole scene.
+    None stands for time 0, `FRAMES` frames and the degree that is needed. Raises `ValueError` for a suffix that is not
+    written, values out of range or that the format does not use, and a selection from a whole scene; `CheckpointError`
+    where no file can be written at `path`.
     """
     format, selection = export_format(path), selection or Selection()
+    check_used(format, time=time, frames=frames, degree=degree)
+    _check_place(path)
     if format not in WHOLE:
-        return ExportRequest(format, time, frames, degree, selection)
+        return ExportRequest(format, time or 0.0, FRAMES if frames is None else frames, degree, selection)
     if selection != Selection():
         raise ValueError(f"a .{format} file holds the whole scene; a box, a sphere and `seen` are for splats")
     return None
 
 
+def _check_place(path: Path) -> None:
+    """Raises `CheckpointError` where `path` is a folder, or is in none that can be written to."""
+    if path.is_dir():
+        raise CheckpointError(f"{path}: is a folder where a file is wanted. Name a file in it.")
+    if not path.parent.is_dir():
+        raise CheckpointError(f"{path}: there is no folder {path.parent}. Make it, or name another place.")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be written ({error.strerror}). Name another place.") from error
+
+
 def export_file(model: Model, path: Path, request: ExportRequest | None) -> str:
     """Write `path` as `export_request` understood it; returns a line on its size and content.
 
-    Raises `ValueError` where no splats are left, and `CheckpointError`.
+    Raises `ValueError` where no splats are left or the format cannot hold them, and `CheckpointError`.
     """
     if request is not None:
         exported = export_splats(model, request)

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from graings.export.export import FORMATS, FRAMES, SEQUENCE, ExportRequest, export_splats
+from graings.export.export import FORMATS, FRAMES, SEQUENCE, ExportRequest, check_used, export_splats
 from graings.export.selection import Selection
 from service.context import ContextDep, JobId
 from service.problems import RESPONSES, BadRequest, Busy, NotYet
@@ -29,8 +29,10 @@ class ExportQuery(BaseModel):
         json_schema_extra={"enum": list(FORMATS)},
         description="ply, compressed.ply, spz, sog, splat, glb, zip: a sequence of PLY files, or 4dgs.",
     )
-    t: float = Field(0.0, ge=0, le=1, description="Time.")
-    frames: int = Field(FRAMES, ge=1, le=MAX_FRAMES, description="Number of times in a zip or 4dgs.")
+    t: float | None = Field(None, ge=0, le=1, description="Time of a format that holds one; default: 0.")
+    frames: int | None = Field(
+        None, ge=1, le=MAX_FRAMES, description=f"Number of times in a zip or 4dgs; default: {FRAMES}."
+    )
     degree: int | None = Field(None, ge=0, le=3, description="Of the spherical harmonics; default: what is needed.")
     box: str | None = Field(None, max_length=240, description="Keep what is in x,y,z,x,y,z, the capture's units.")
     sphere: str | None = Field(None, max_length=160, description="Keep what is in x,y,z,radius.")
@@ -42,7 +44,8 @@ def export(job_id: JobId, here: ContextDep, query: Annotated[ExportQuery, Query(
     """The newest model of a job as splats. One export is made at a time."""
     try:
         selection = Selection(_numbers(query.box), _numbers(query.sphere), query.seen)
-        request = ExportRequest(query.format, query.t, query.frames, query.degree, selection)
+        check_used(query.format, time=query.t, frames=query.frames, degree=query.degree)
+        request = ExportRequest(query.format, query.t or 0.0, query.frames or FRAMES, query.degree, selection)
     except ValueError as error:
         raise BadRequest(f"{error}.") from error
     loaded = here.models.load(here.store.folder(job_id).run)

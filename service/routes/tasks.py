@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Response
+from fastapi import APIRouter, Query, Response
+from fastapi import Path as InPath
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
 
 from graings.errors import CheckpointError
 from graings.export.camera_path import frames_of
 from graings.export.shown import Shown
+from graings.export.video import check_video
 from jobs.job import JobConflict, JobState
 from jobs.task import MAX_FRAMES, EvaluationSpec, HeldOut, Task, TaskProgress, TaskSpec, VideoSpec
 from service.context import ContextDep, JobId
@@ -23,7 +26,7 @@ router = APIRouter(prefix="/jobs/{job_id}", tags=["tasks"], responses=RESPONSES)
 MEDIA_TYPES = {"mp4": "video/mp4", "webm": "video/webm", "webp": "image/webp", "gif": "image/gif"}
 RETRY_AFTER_S = "1"
 
-TaskId = Annotated[str, Path(description="Id of a task.", examples=["019a2b3c4d5e8f01"], max_length=64)]
+TaskId = Annotated[str, InPath(description="Id of a task.", examples=["019a2b3c4d5e8f01"], max_length=64)]
 
 
 class TaskResource(BaseModel):
@@ -71,6 +74,7 @@ def make_video(job_id: JobId, spec: VideoSpec, context: ContextDep, response: Re
     model = loaded.model
     shown = Shown(loaded.scene, model.units, model.views, model.background, model.digest)
     try:  # now, while the client waits: nothing but the rendering is left to the worker
+        check_video(Path(f"video.{spec.format}"), spec.fps)
         count = len(frames_of(shown, spec.request, spec.path, spec.moves, spec.frames))
     except (ValueError, CheckpointError) as error:
         raise BadRequest(f"{error}".rstrip(".") + ".") from error

@@ -14,6 +14,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from client import Client
 from graings.evaluation.metrics import psnr
 from tests.browser.conftest import OpenPage
 
@@ -139,6 +140,13 @@ def test_test_views_are_measured_and_a_video_is_made(service: str, job: str, ope
     page.locator("#tasks li", has_text=re.compile(r"Evaluation of test: \d+\.\d\d dB")).wait_for()
     address = page.locator("#tasks a").get_attribute("href")
     assert httpx2.get(f"{service}{address}").content[4:8] == b"ftyp"
+    # Trained for longer, the job has metrics without that split, and the list keeps what was made.
+    assert httpx2.post(f"{service}/jobs/{job}/extend", params={"iterations": 5}).status_code == 202
+    with Client(service) as client:
+        assert client.wait(job).state == "succeeded"
+    page.reload()
+    page.locator("#tasks li", has_text="Evaluation of test: of an earlier model").wait_for()
+    page.locator("#tasks li", has_text="Video (mp4)").get_by_role("link", name="download").wait_for()
 
 
 def test_without_webgl_the_server_draws(service: str, job: str, browser: Any) -> None:

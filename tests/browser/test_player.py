@@ -51,7 +51,9 @@ def page_file(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
     text = player_html(scene_bytes(model)).decode()
     end = "</script>\n</body>"
     assert text.count(end) == 1
-    reachable = "Object.assign(window, { player, Renderer, Sorter, cameraOf, viewpointOf });\n"
+    reachable = (
+        "Object.assign(window, { player, Pictures, Renderer, Sorter, cameraOf, orbit, stateText, viewpointOf });\n"
+    )
     path = tmp_path_factory.mktemp("page") / "scene.html"
     path.write_text(text.replace(end, reachable + end))
     return path
@@ -182,6 +184,73 @@ def test_a_link_restores_view_and_time(still: Any, page_file: Path, open_page: O
     pictures = [shown(each, tmp_path) for each in (still, other)]
     assert psnr(*pictures) > 40
     assert float(np.std(pictures[0])) > 0.02  # there is something in it
+
+
+def test_a_link_opened_in_the_same_tab_restores_view_and_time(page: Any, page_file: Path) -> None:
+    page.get_by_role("button", name="Pause").wait_for()  # it plays
+    there = page.evaluate("stateText(0.4, orbit(player.view, player.facts.units.up, 1, 0.1))")
+    page.goto(f"{page_file.as_uri()}#{there}")
+    page.get_by_role("button", name="Play", exact=True).wait_for()
+    assert page.evaluate("player.time") == 0.4
+    restored = state(page)
+    numbers = [[float(x) for x in text.split("view=")[1].split(",")] for text in (restored, there)]
+    np.testing.assert_allclose(*numbers, atol=2e-5)  # each rounding is of 1e-5
+    page.goto(f"{page_file.as_uri()}#")
+    assert state(page) == restored
+
+
+# Where a point of the scene, the target before, is drawn now.
+DRAWN_AT = """
+(point) => {
+  const { rotation, center, fx, fy, cx, cy } = player.camera(1);
+  const arm = point.map((value, i) => value - center[i]);
+  const [x, y, z] = [0, 3, 6].map((row) => arm.reduce((sum, value, i) => sum + rotation[row + i] * value, 0));
+  return [(fx * x) / z + cx, (fy * y) / z + cy];
+}
+"""
+
+
+@pytest.mark.parametrize(("width", "height"), [(500, 500), (900, 400), (400, 700)])
+def test_the_scene_follows_the_hand_in_a_window_of_any_shape(
+    width: int, height: int, page_file: Path, open_page: OpenPage
+) -> None:
+    opened = open_page(page_file.as_uri(), viewport={"width": width, "height": height})
+    opened.locator("#player[data-ready]").wait_for()
+    opened.get_by_role("button", name="Pause").click()
+    box = opened.locator(".stage").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    point = opened.evaluate("player.view.target")
+    before = opened.evaluate(DRAWN_AT, point)
+    opened.keyboard.down("Shift")
+    opened.mouse.move(x, y)
+    opened.mouse.down()
+    opened.mouse.move(x + 60, y + 30, steps=3)
+    opened.mouse.up()
+    opened.keyboard.up("Shift")
+    np.testing.assert_allclose(np.subtract(opened.evaluate(DRAWN_AT, point), before), (60, 30), atol=0.5)
+
+
+# A request of a job that is under way when another job is chosen; it then succeeds or fails.
+LATE = """
+async (fails) => {
+  let answer;
+  const image = { src: "", decode: async () => {}, classList: player.image.classList };
+  window.fetch = () => new Promise((resolve, reject) => {
+    answer = () => (fails ? reject(new Error("too late")) : resolve({ ok: true, blob: async () => new Blob(["x"]) }));
+  });
+  player.pictures = new Pictures("/render?job=a", image, (error) => player.say(error ? error.message : ""));
+  player.exact(1, 100);
+  player.clear("another job");
+  answer();
+  await new Promise((resolve) => setTimeout(resolve, 100));
+  return [image.src, image.classList.contains("shown"), player.message.textContent];
+}
+"""
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_picture_that_comes_after_its_job_was_left_is_not_shown(still: Any, fails: bool) -> None:
+    assert still.evaluate(LATE, fails) == ["", False, "another job"]
 
 
 def test_every_control_has_a_name(page: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -10,9 +11,16 @@ from urllib.parse import unquote
 import pytest
 from typer.testing import CliRunner
 
+from graings.api import gallery
+from graings.api.gallery import write_gallery
 from graings.capture.synthetic import synthesize
 from graings.cli.main import app
 from graings.config import make_config
+from graings.errors import CheckpointError
+from graings.evaluation.metrics import SplitMetrics
+from graings.report.metrics_document import read_metrics
+from graings.storage.files import write_document
+from graings.storage.run_folder import CHECKPOINTS, METRICS_FILE, MODEL_FILE, RECORD_FILE
 from graings.training.run import TrainingRun
 
 pytest.importorskip("av")
@@ -55,3 +63,37 @@ def test_runs_that_are_not_finished_or_share_a_name_are_refused(run: Path, tmp_p
     assert twice.exit_code == 2
     assert "rename one" in " ".join(twice.output.split())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("wrong", ["unfinished", "without metrics", "without record", "without model", "named index"])
+def test_a_run_that_cannot_be_shown_is_refused_before_others_are_rendered(
+    run: Path, tmp_path: Path, wrong: str
+) -> None:
+    other = Path(shutil.copytree(run, tmp_path / ("index" if wrong == "named index" else "second")))
+    if wrong == "unfinished":
+        metrics = json.loads((other / METRICS_FILE).read_text())
+        (other / METRICS_FILE).write_text(json.dumps(metrics | {"iterations_planned": 10_000}))
+    elif wrong == "without metrics":
+        (other / METRICS_FILE).unlink()
+    elif wrong == "without record":
+        (other / RECORD_FILE).unlink()
+    elif wrong == "without model":
+        shutil.rmtree(other / CHECKPOINTS)
+        (other / MODEL_FILE).unlink()
+    seen: list[int] = []
+    expected = ValueError if wrong == "named index" else CheckpointError
+    with pytest.raises(expected, match="index" if wrong == "named index" else "second"):
+        write_gallery([run, other], tmp_path / "gallery", observe=lambda done, total: seen.append(done))
+    assert seen == []
+    assert not (tmp_path / "gallery").exists()
+
+
+def test_a_split_without_images_has_no_number(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    metrics = read_metrics(run / METRICS_FILE)
+    other = Path(shutil.copytree(run, tmp_path / "second"))
+    empty = metrics.model_copy(update={"splits": {**metrics.splits, "test": SplitMetrics.over([])}})
+    write_document(other / METRICS_FILE, empty)
+    monkeypatch.setattr(gallery, "SECONDS", 0.1)
+    text = write_gallery([other], tmp_path / "gallery").read_text()
+    assert re.search(r"<p>val \d+\.\d\d dB · \d+ min of CPU time", text)
+    assert "test" not in text

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,15 +15,18 @@ from graings.camera.camera import Camera, View
 from graings.camera.orbit import azimuths
 from graings.camera.view_request import ViewRequest
 from graings.errors import CheckpointError
-from graings.export.camera_path import PathKey, frames_of, spline
-from graings.export.shown import Shown
+from graings.export.camera_path import Moves, frames_of
+from graings.export.formats import WRITERS
+from graings.export.shown import Shown, open_shown
+from graings.export.spline import PathKey, spline
 from tests.export.models import UNITS, ring, tiny_shown
+from tests.export.test_harmonics_fit import random_splats
 
 WHITE = (1.0, 1.0, 1.0)
 
 
 def test_time_runs_at_a_fixed_camera() -> None:
-    frames = frames_of(tiny_shown(), ViewRequest(camera="train:3"), "orbit", "time", 5)
+    frames = frames_of(tiny_shown(), ViewRequest(camera="train:3"), None, "time", 5)
     assert [time for _, time in frames] == [0.0, 0.25, 0.5, 0.75, 1.0]
     assert all(camera is frames[0][0] for camera, _ in frames)
 
@@ -79,6 +83,16 @@ def test_a_video_of_a_capture_from_all_sides_goes_around_it() -> None:
         np.testing.assert_array_equal(camera.world_to_camera, expected.world_to_camera)
 
 
+def test_a_video_of_a_file_of_splats_goes_around_it(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(WRITERS["ply"](random_splats(50, 0), UNITS))
+    shown = open_shown(tmp_path / "a.ply")
+    for request in (ViewRequest(), ViewRequest(width=64)):
+        frames = frames_of(shown, request, None, "both", 36)
+        angles = azimuths(np.stack([camera.center for camera, _ in frames]), shown.units.up)
+        turns = np.remainder(np.diff(np.append(angles, angles[0])) + 180.0, 360.0) - 180.0
+        np.testing.assert_allclose(turns, 10.0, atol=1e-6)
+
+
 def test_a_spline_passes_through_its_keys() -> None:
     keys = [PathKey(camera, time) for camera, time in zip(ring(4), (0.0, 0.2, 0.9, 1.0), strict=True)]
     found = spline(keys, 10)
@@ -119,6 +133,51 @@ def test_nerfstudio_files_are_followed_frame_by_frame(tmp_path: Path) -> None:
         assert camera.fx == pytest.approx(expected.fx)
 
 
+def nerfstudio(**frame: object) -> str:
+    """A file with one frame."""
+    whole = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50, **frame}
+    return json.dumps({"camera_path": [whole], "render_width": 4, "render_height": 4})
+
+
+@pytest.mark.parametrize(("time", "used"), [(-0.5, 0.0), (0.25, 0.25), (3.5, 1.0), (7, 1.0)])
+def test_a_time_of_nerfstudio_is_clamped_as_every_other(time: float, used: float, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(nerfstudio(render_time=time))
+    ((_, found),) = frames_of(tiny_shown(), ViewRequest(), str(tmp_path / "a.json"), "both", 3)
+    assert found == used
+
+
+@pytest.mark.parametrize("value", [7, 7.5, True, "many", [1, 2], [[1.0] * 4] * 4, {"a": 1}, [None]])
+@pytest.mark.parametrize(
+    "key", ["camera", "azimuth", "elevation", "radius", "target", "fov", "pose", "width", "height", "t"]
+)
+def test_a_value_of_any_type_in_a_key_is_used_or_refused_with_the_names_of_both(
+    key: str, value: object, tmp_path: Path
+) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"keys": [{}, {key: value}]}))
+    numbers = ("azimuth", "elevation", "radius", "fov")
+    fits = (type(value) is int and key in (*numbers, "width", "height")) or (type(value) is float and key in numbers)
+    if fits:
+        assert len(frames_of(tiny_shown(), ViewRequest(), str(tmp_path / "a.json"), "both", 3)) == 3
+        return
+    with pytest.raises(CheckpointError, match=rf"a\.json: .*(keys\[1\].* {key}|t for every key)"):
+        frames_of(tiny_shown(), ViewRequest(), str(tmp_path / "a.json"), "both", 3)
+
+
+@pytest.mark.parametrize("entry", [None, 3, "train:0", [], [[1, 2]], True])
+def test_a_key_or_frame_that_is_no_object_is_refused_with_its_number(entry: object, tmp_path: Path) -> None:
+    path = {"camera_path": [entry], "render_width": 4, "render_height": 4}
+    for document, name in (({"keys": [{}, entry]}, r"keys\[1\]"), (path, r"camera_path\[0\]")):
+        (tmp_path / "a.json").write_text(json.dumps(document))
+        with pytest.raises(CheckpointError, match=name):
+            frames_of(tiny_shown(), ViewRequest(), str(tmp_path / "a.json"), "both", 3)
+
+
+def test_a_value_of_null_in_a_key_stands_for_the_default(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"keys": [{"azimuth": 10, "t": null, "camera": null, "pose": null}]}')
+    frames = frames_of(tiny_shown(), ViewRequest(), str(tmp_path / "a.json"), "both", 3)
+    assert [time for _, time in frames] == [0.0, 0.5, 1.0]
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -129,7 +188,22 @@ def test_nerfstudio_files_are_followed_frame_by_frame(tmp_path: Path) -> None:
         ('{"keys": [{"camera": "test:9"}]}', "test"),
         ('{"keys": [{"t": 0}, {}]}', "every key or for none"),
         ('{"camera_path": [], "render_width": 4, "render_height": 4}', "empty"),
-        ('{"camera_path": [{"fov": 50}], "render_width": 4, "render_height": 4}', "camera_to_world"),
+        (
+            '{"camera_path": [{"fov": 50}], "render_width": 4, "render_height": 4}',
+            r"camera_path\[0\] has no camera_to_world",
+        ),
+        ('{"camera_path": 3, "render_width": 4, "render_height": 4}', "list of frames"),
+        ('{"camera_path": [{}], "render_width": 4}', "render_height must be a finite number"),
+        ('{"keys": [{"azimuth": 3}], "closed": "no"}', "closed must be true or false"),
+        ('{"keys": [{"t": NaN}]}', r"keys\[0\]: t must be a finite number"),
+        (nerfstudio(render_time=math.nan), r"camera_path\[0\]: render_time must be a finite number"),
+        (nerfstudio(render_time=math.inf), "render_time"),
+        (nerfstudio(render_time="late"), "render_time"),
+        (nerfstudio(fov="wide"), "fov must be a finite number"),
+        (nerfstudio(fov=180), r"camera_path\[0\]: fov must lie between"),
+        (nerfstudio(camera_to_world=[0.0] * 16), r"camera_path\[0\]: camera_to_world is no pose"),
+        (nerfstudio(camera_to_world={"a": 1}), r"camera_path\[0\]: camera_to_world is no pose"),
+        (nerfstudio(camera_to_world=[math.nan] * 16), r"camera_path\[0\]: camera_to_world is no pose"),
     ],
 )
 def test_a_broken_path_is_refused_with_its_name(content: str, message: str, tmp_path: Path) -> None:
@@ -143,3 +217,32 @@ def test_wrong_requests_are_refused() -> None:
         frames_of(tiny_shown(), ViewRequest(), "orbit", "both", 0)
     with pytest.raises(ValueError, match="orbit starts"):
         frames_of(tiny_shown(), ViewRequest(camera="train:0"), "orbit", "both", 3)
+
+
+@pytest.mark.parametrize(
+    ("request_", "path", "moves", "message"),
+    [
+        (ViewRequest(), "orbit", "time", "path is for a camera that moves"),
+        (ViewRequest(), "views", "time", "path is for a camera that moves"),
+        (ViewRequest(), {"keys": [{}]}, "time", "path is for a camera that moves"),
+        (ViewRequest(t=0.5), None, "time", "t is the time while only the camera moves"),
+        (ViewRequest(t=0.5), None, "both", "t is the time while only the camera moves"),
+        *(
+            (ViewRequest(**{name: value}), path, "both", rf"path has its own viewpoints, so {name} ")  # type: ignore[arg-type]
+            for name, value in (
+                ("camera", "train:0"),
+                ("azimuth", 3.0),
+                ("elevation", 3.0),
+                ("radius", 3.0),
+                ("target", (0.0, 0.0, 0.0)),
+                ("fov", 40.0),
+            )
+            for path in ("views", {"keys": [{}]})
+        ),
+    ],
+)
+def test_a_value_that_would_have_no_effect_is_refused(
+    request_: ViewRequest, path: Any, moves: Moves, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        frames_of(tiny_shown(), request_, path, moves, 3)

@@ -21,11 +21,12 @@ from torch import Tensor
 from graings.camera.camera import Camera
 from graings.camera.units import Units
 from graings.errors import CheckpointError
-from graings.export.export import FORMATS, ExportRequest, export_format, export_splats
+from graings.export.export import FORMATS, SEVERAL, WHOLE, ExportRequest, check_used, export_format, export_splats
 from graings.export.formats import READABLE, WRITERS, half_turn, read_splats
+from graings.export.harmonics_fit import fit_splats
 from graings.export.selection import Selection
 from graings.export.shown import open_shown
-from graings.render import render
+from graings.render import PreparedScene, render
 from graings.scene.splats import Splats
 from tests.export.models import SIZE, UNITS, ring, tiny_model
 from tests.export.test_harmonics_fit import psnr, random_splats
@@ -123,12 +124,61 @@ def test_a_gltf_node_turns_the_captures_vertical_to_y(up: tuple[float, float, fl
     np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-6)
 
 
-@pytest.mark.parametrize("format", [name for name in FORMATS if name != "zip"])
+@pytest.mark.parametrize("format", [name for name in FORMATS if name not in ("zip", "splat")])
 def test_every_format_is_written_from_a_model(format: str) -> None:
     exported = export_splats(tiny_model(), ExportRequest(format, time=0.5, degree=1))
     assert exported.splats > 20
     assert exported.degree == 1
     assert len(exported.data) > 500
+
+
+def test_a_format_without_view_dependence_has_the_colours_of_a_fit_of_degree_0() -> None:
+    model = tiny_model()
+    exported = export_splats(model, ExportRequest("splat", time=0.5))
+    assert exported.degree == 0
+    cameras = [view.camera for view in model.views["train"]]
+    plain = fit_splats(PreparedScene(model.scene), cameras, 0.5, degree=0).splats
+    assert exported.data == WRITERS["splat"](plain, model.units)
+    assert exported.data == export_splats(model, ExportRequest("splat", time=0.5, degree=0)).data
+
+
+@pytest.mark.parametrize(
+    ("units", "message"),
+    [
+        (Units((5000.0, 0.0, 0.0), 1.0), "coordinates below 2048, and here they reach 500"),
+        (Units((0.0, 0.0, -2047.9), 1.0), "coordinates below 2048, and here they reach 2048"),
+        (Units((0.0, 0.0, 0.0), 2.0**-12), "coordinates below 2048"),
+        (Units((0.0, 0.0, 0.0), 2.0**-11), "splats up to a size of 379, and here they reach"),
+        (
+            Units((0.0, 0.0, 0.0), 2.0**9),
+            "steps of 1/4096, and here half of the splats are smaller than 0.000",
+        ),
+        (Units((0.0, 0.0, 0.0), 2.0**16), "steps of 1/4096"),
+    ],
+)
+def test_splats_that_an_spz_cannot_hold_are_refused(units: Units, message: str) -> None:
+    splats = random_splats(200, 0)
+    with pytest.raises(ValueError, match=rf"\.spz file holds .*{message}.*choose \.sog or \.ply"):
+        WRITERS["spz"](splats, units)
+
+
+@pytest.mark.parametrize("exponent", [-14, -10, 0, 6, 8, 12])
+@pytest.mark.parametrize("format", KEEPS)
+def test_a_format_is_right_or_refused_in_any_units(format: str, exponent: int, tmp_path: Path) -> None:
+    splats, units = replace(random_splats(200, 0), sampling=None), Units((0.0, 0.0, 0.0), 2.0**exponent)
+    file = tmp_path / f"a.{format}"
+    try:
+        file.write_bytes(WRITERS[format](splats, units))
+    except ValueError:
+        assert format == "spz"
+        assert not -10 <= exponent <= 6
+        return
+    again, others = read_splats(file)
+    for camera in ring(3):
+        pose = others.camera(units.camera_back(camera))
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        drawn = render(again, Camera(pose, *lens), 0.0, WHITE).color
+        assert psnr(render(splats, camera, 0.0, WHITE).color, drawn) > KEEPS[format]
 
 
 def test_a_sequence_has_a_manifest_and_a_file_for_each_time(tmp_path: Path) -> None:
@@ -177,6 +227,7 @@ def test_a_selection_drops_what_lies_outside_or_is_not_seen(tmp_path: Path) -> N
         (lambda: ExportRequest("ply", time=math.nan), "time"),
         (lambda: ExportRequest("zip", frames=0), "frames"),
         (lambda: ExportRequest("ply", degree=4), "degree"),
+        (lambda: ExportRequest("splat", degree=1), r"degree must be 0 for a \.splat file"),
         (lambda: export_format(Path("a.obj")), r"\.ply, .*\.spz"),
         (lambda: export_format(Path("ply")), r"choose one of"),
     ],
@@ -184,6 +235,18 @@ def test_a_selection_drops_what_lies_outside_or_is_not_seen(tmp_path: Path) -> N
 def test_a_wrong_request_is_refused(wrong: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         wrong()
+
+
+@pytest.mark.parametrize("format", [*FORMATS, *WHOLE])
+def test_what_a_format_does_not_use_is_refused_with_both_names(format: str) -> None:
+    used = {"frames", "degree"} if format in SEVERAL else set() if format in WHOLE else {"time", "degree"}
+    for name, value in (("time", 0.0), ("frames", 30), ("degree", 0)):
+        if name in used:
+            check_used(format, **{name: value})  # type: ignore[arg-type]
+        else:
+            with pytest.raises(ValueError, match=rf"{name} is not used by a \.{format} file"):
+                check_used(format, **{name: value})  # type: ignore[arg-type]
+    check_used(format)
 
 
 def test_a_suffix_of_two_parts_wins() -> None:

@@ -17,7 +17,7 @@ from graings.camera.view_request import ViewRequest
 from graings.errors import CheckpointError
 from graings.export import video_parts
 from graings.export.camera_path import frames_of
-from graings.export.video import FORMATS, check_video, write_video
+from graings.export.video import FORMATS, check_video, video_size, write_video
 from graings.export.video_file import decoded, video_file
 from graings.export.video_parts import open_parts
 from graings.render import render
@@ -113,7 +113,9 @@ def test_an_animated_picture_shows_no_trace_of_earlier_frames(suffix: str, tmp_p
 
 
 def test_odd_sides_lose_a_pixel_where_colour_is_subsampled(tmp_path: Path) -> None:
-    frames = frames_of(tiny_shown(), ViewRequest(width=33, height=21), "orbit", "time", 2)
+    frames = frames_of(tiny_shown(), ViewRequest(width=33, height=21), None, "time", 2)
+    assert video_size(tmp_path / "a.mp4", frames[0][0]) == (32, 20)
+    assert video_size(tmp_path / "a.gif", frames[0][0]) == (33, 21)
     write_video(tmp_path / "a.mp4", tiny_shown(), frames, WHITE)
     assert pictures(tmp_path / "a.mp4")[0].shape == (20, 32, 3)
 
@@ -230,8 +232,24 @@ def test_a_folder_in_place_of_a_file_and_the_reverse_are_refused_before_any_work
 
 def test_wrong_requests_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"\.mp4, \.webm"):
-        check_video(Path("a.avi"))
+        check_video(Path("a.avi"), 30.0)
     with pytest.raises(ValueError, match=r"\.mp4, \.webm"):
-        check_video(Path("a.mkv"))
+        check_video(Path("a.mkv"), 30.0)
     with pytest.raises(ValueError, match="fps"):
         write_video(tmp_path / "a.mp4", tiny_shown(), path_of(2), WHITE, fps=0)
+
+
+@pytest.mark.parametrize("fps", [100.01, 101.0, 240.0])
+def test_a_rate_that_gif_does_not_have_is_refused_before_any_work(fps: float, tmp_path: Path) -> None:
+    seen: list[int] = []
+    with pytest.raises(ValueError, match=r"fps must lie in \(0, 100\] for a \.gif file"):
+        write_video(tmp_path / "a.gif", tiny_shown(), path_of(3), WHITE, fps=fps, observe=seen.append)
+    assert seen == []
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("suffix", "fps"), [(".gif", 100.0), (".gif", 99.97), (".webp", 240.0), (".webm", 240.0)])
+def test_the_highest_rate_of_a_format_is_written(suffix: str, fps: float, tmp_path: Path) -> None:
+    path = tmp_path / f"a{suffix}"
+    write_video(path, tiny_shown(), path_of(30), WHITE, fps=fps)
+    assert len(pictures(path)) == 30

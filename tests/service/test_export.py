@@ -49,6 +49,9 @@ def test_a_sequence_is_an_archive(client: TestClient, model: str) -> None:
         ({"format": "ply", "sphere": "1,2,3,nan"}, "finite"),
         ({"format": "ply", "sphere": "900,0,0,1"}, "widen"),
         ({"format": "zip", "frames": "100000"}, "frames"),
+        ({"format": "zip", "frames": "2", "t": "0.5"}, "time is not used"),
+        ({"format": "ply", "frames": "2"}, "frames is not used"),
+        ({"format": "splat", "degree": "1"}, "degree"),
     ],
 )
 def test_a_wrong_parameter_is_named(client: TestClient, model: str, parameters: dict[str, str], word: str) -> None:

@@ -138,6 +138,9 @@ def test_a_video_goes_on_after_the_death_of_its_worker_and_a_deleted_one_stops(
         ({"background": "mauve"}, "background"),
         ({"width": 0}, "width"),
         ({"fps": -1}, "fps"),
+        ({"fps": 120, "format": "gif"}, "fps"),
+        ({"path": {"keys": [{"camera": 3, "t": 0}]}}, "keys[0]"),
+        ({"path": {"keys": [{"azimuth": 0, "t": 0}]}, "moves": "time"}, "path"),
         ({"zoom": 2}, "zoom"),
     ],
 )

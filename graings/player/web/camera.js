@@ -101,11 +101,11 @@ export function orbit(view, up, yaw, pitch) {
   return { ...view, rotation: [...side, ...cross(ahead, side), ...ahead] };
 }
 
-/** Moved by shares of the picture's width to the right and down, as the hand moves the scene. */
-export function pan(view, x, y) {
+/** Moved so that the target goes `x` px to the right and `y` down in the picture of `camera`, which sees the view. */
+export function pan(view, x, y, camera) {
   const [right, down] = axes(view.rotation);
-  const length = view.radius / view.focal;
-  return { ...view, target: add(add(view.target, right, -x * length), down, -y * length) };
+  const [across, along] = [(x * view.radius) / camera.fx, (y * view.radius) / camera.fy];
+  return { ...view, target: add(add(view.target, right, -across), down, -along) };
 }
 
 /** Nearer by a factor below 1, farther by one above. */

@@ -1,13 +1,13 @@
 // Gestures: mouse, touch and keys on the stage, as changes of the viewpoint and calls of actions.
 
 const KEY_ANGLE = (5 / 180) * Math.PI;
-const KEY_PAN = 0.05;
+const KEY_PAN = 0.05; // of the stage's width
 const TURN = Math.PI; // radians for a drag over the whole width
 
 /**
  * @typedef {object} Hand
  * @property {(yaw: number, pitch: number) => void} orbit radians
- * @property {(x: number, y: number) => void} pan shares of the stage's width
+ * @property {(x: number, y: number) => void} pan px of the page
  * @property {(factor: number) => void} zoom
  * @property {(held: boolean) => void} hold a hand is on the stage, or no longer
  * @property {() => void} reset
@@ -36,20 +36,19 @@ export function listen(stage, hand) {
   stage.addEventListener("pointermove", (event) => {
     const before = fingers.get(event.pointerId);
     if (!before) return;
-    const width = stage.clientWidth;
     const now = { x: event.clientX, y: event.clientY };
     if (fingers.size >= 2) {
       const old = spread();
       fingers.set(event.pointerId, now);
       const next = spread();
-      hand.pan((next.x - old.x) / width, (next.y - old.y) / width);
+      hand.pan(next.x - old.x, next.y - old.y);
       if (next.distance > 0) hand.zoom(old.distance / next.distance);
       return;
     }
     fingers.set(event.pointerId, now);
-    const [x, y] = [(now.x - before.x) / width, (now.y - before.y) / width];
+    const [x, y] = [now.x - before.x, now.y - before.y];
     if (event.shiftKey || event.buttons > 1) hand.pan(x, y);
-    else hand.orbit(-x * TURN, y * TURN);
+    else hand.orbit((-x / stage.clientWidth) * TURN, (y / stage.clientWidth) * TURN);
   });
   for (const name of ["pointerup", "pointercancel"]) {
     stage.addEventListener(name, (event) => {
@@ -72,7 +71,8 @@ export function listen(stage, hand) {
   stage.addEventListener("keydown", (event) => {
     if (event.target !== stage || event.ctrlKey || event.altKey || event.metaKey) return;
     const move = moves[event.key];
-    if (move && event.shiftKey) hand.pan(move[0] * KEY_PAN, move[1] * KEY_PAN);
+    const step = KEY_PAN * stage.clientWidth;
+    if (move && event.shiftKey) hand.pan(move[0] * step, move[1] * step);
     else if (move) hand.orbit(-move[0] * KEY_ANGLE, move[1] * KEY_ANGLE);
     else if (event.key === "+" || event.key === "=") hand.zoom(0.9);
     else if (event.key === "-") hand.zoom(1 / 0.9);

@@ -11,6 +11,12 @@ try {
   await player.use(bytes.buffer);
   player.state = location.hash.slice(1);
   if (!location.hash) player.play(true);
+  // A link is opened in the same tab.
+  window.addEventListener("hashchange", () => {
+    if (!location.hash) return;
+    player.play(false);
+    player.state = location.hash.slice(1);
+  });
 } catch (error) {
   player.say(error.message);
 }

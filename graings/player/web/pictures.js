@@ -46,6 +46,13 @@ export class Pictures {
     this.image.classList.remove("shown");
   }
 
+  /** Show none and report nothing from now on, whatever is under way: the image and the messages are another's. */
+  close() {
+    this.alone = false;
+    this.report = () => {};
+    this.hide();
+  }
+
   async run() {
     this.busy = true;
     while (this.wanted !== null) {

@@ -54,7 +54,7 @@ export class Player {
     };
     listen(this.stage, {
       orbit: changed((view, yaw, pitch) => orbit(view, this.facts.units.up, yaw, pitch)),
-      pan: changed(pan),
+      pan: changed((view, x, y) => pan(view, x, y, this.camera(1))),
       zoom: changed(zoom),
       hold: (held) => this.change(held),
       reset: () => this.reset(),
@@ -156,7 +156,7 @@ export class Player {
     this.play(false);
     clearTimeout(this.timer);
     this.release();
-    this.pictures?.hide();
+    this.pictures?.close();
     Object.assign(this, { facts: null, pictures: null, view: null });
     this.canvas.width = this.canvas.width; // emptied
     this.progress.hidden = true;
