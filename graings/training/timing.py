@@ -26,7 +26,7 @@ class Clock:
     seconds: dict[str, float] = field(default_factory=dict)
     before_s: float = 0.0
     train_cpu_s: float = 0.0
-    _started: float = field(default_factory=time.perf_counter)
+    _started: float = field(default_factory=lambda: time.perf_counter())  # looked up now: tests replace the time
 
     def add(self, phase: str, seconds: float, cpu_s: float = 0.0) -> None:
         """Add `seconds` to a phase of training, or to load, evaluation, checkpoint or report.
