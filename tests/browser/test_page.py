@@ -57,8 +57,7 @@ def test_upload_train_and_play(service: str, capture: Path, open_page: OpenPage,
     page.locator("#jobs .succeeded").first.wait_for()
     page.get_by_role("button", name="Play", exact=True).click()
     before = page.locator(".clock").text_content()
-    page.wait_for_timeout(1000)
-    assert page.locator(".clock").text_content() != before
+    page.wait_for_function("before => document.querySelector('.clock').textContent !== before", arg=before)
     found = httpx2.get(f"{service}/jobs").json()["jobs"]
     (job,) = [entry for entry in found if entry["name"] == "walking"]
     config = httpx2.get(f"{service}{job['links']['self']}").json()["config"]
