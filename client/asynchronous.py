@@ -15,7 +15,7 @@ import httpx2
 from client import calls
 from client.answers import ClientError, Event, RefusedError, RemoteJob
 from client.captures import Observe, packed, uploading
-from client.patience import Patience, passes
+from client.retry_limit import RetryLimit
 
 T = TypeVar("T")
 
@@ -96,7 +96,7 @@ class AsyncClient:
 
     async def events(self, job_id: str, after: str | None = None) -> AsyncIterator[Event]:
         """What happens to a job, until it has ended; a broken connection is opened again where it broke."""
-        patience = Patience()
+        limit = RetryLimit()
         while True:
             headers = {} if after is None else {"Last-Event-ID": after}
             try:
@@ -104,19 +104,17 @@ class AsyncClient:
                     if not stream.response.is_success:
                         await stream.response.aread()
                         calls.read(stream.response, lambda response: None)
-                    patience.succeeded()
+                    limit.succeeded()
                     async for event in stream:
                         after = event.id or after
                         yield Event(event.event, event.json())  # type: ignore[arg-type]
                         if event.event == "end":
                             return
             except httpx2.TransportError as error:
-                patience.failed(ClientError(calls.no_answer(self._http.base_url, error)))
+                limit.failed(ClientError(calls.no_answer(self._http.base_url, error)))
             except RefusedError as error:
-                if not passes(error):
-                    raise
-                patience.failed(error)
-            patience.check()
+                limit.failed(error)
+            limit.check()
             await asyncio.sleep(calls.RECONNECT_S)
 
     async def wait(self, job_id: str, observe: Callable[[Event], None] | None = None) -> RemoteJob:

@@ -14,7 +14,7 @@ import httpx2
 from client import calls
 from client.answers import ClientError, Event, RefusedError, RemoteJob
 from client.captures import Observe, packed, uploading
-from client.patience import Patience, passes
+from client.retry_limit import RetryLimit
 
 T = TypeVar("T")
 
@@ -95,7 +95,7 @@ class Client:
 
     def events(self, job_id: str, after: str | None = None) -> Iterator[Event]:
         """What happens to a job, until it has ended; a broken connection is opened again where it broke."""
-        patience = Patience()
+        limit = RetryLimit()
         while True:
             headers = {} if after is None else {"Last-Event-ID": after}
             try:
@@ -103,19 +103,17 @@ class Client:
                     if not stream.response.is_success:
                         stream.response.read()
                         calls.read(stream.response, lambda response: None)
-                    patience.succeeded()
+                    limit.succeeded()
                     for event in stream:
                         after = event.id or after
                         yield Event(event.event, event.json())  # type: ignore[arg-type]
                         if event.event == "end":
                             return
             except httpx2.TransportError as error:
-                patience.failed(ClientError(calls.no_answer(self._http.base_url, error)))
+                limit.failed(ClientError(calls.no_answer(self._http.base_url, error)))
             except RefusedError as error:
-                if not passes(error):
-                    raise
-                patience.failed(error)
-            patience.check()
+                limit.failed(error)
+            limit.check()
             time.sleep(calls.RECONNECT_S)
 
     def wait(self, job_id: str, observe: Callable[[Event], None] | None = None) -> RemoteJob:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from client import calls
-from client.answers import ClientError, RefusedError
-from client.patience import Patience, passes
+from client.answers import ClientError
+from client.retry_limit import RetryLimit
 
 CHUNK = 1 << 20
 # Bytes of one request: a proxy may keep a body back until it is complete, and loses it when the connection breaks.
@@ -57,11 +57,11 @@ def uploading(archive: Path, observe: Observe | None) -> Generator[Step, dict[st
 
     Each step is a request with its body and a pause before it; the answer is sent back, or a `ClientError` thrown in.
     After an interruption the service is asked how far it came, and the rest is sent, until nothing has arrived for
-    `PATIENCE_S` after the first failure.
+    `RETRY_FOR_S` after the first failure.
     """
     size = archive.stat().st_size
     state = yield calls.begin_upload(size), None, 0.0
-    received, broken, patience = 0, False, Patience()
+    received, broken, limit = 0, False, RetryLimit(BROKEN_BODY)
     while broken or received < size:
         end, asked = min(size, received + PART), broken
         try:
@@ -72,14 +72,12 @@ def uploading(archive: Path, observe: Observe | None) -> Generator[Step, dict[st
                 state = yield part, chunks(archive, observe, received, end), 0.0
             broken = False
         except ClientError as error:
-            if not passes(error) and not (isinstance(error, RefusedError) and error.status == BROKEN_BODY):
-                raise
-            patience.failed(error)
+            limit.failed(error)
             broken = True
         if state["received"] > received:
             received = state["received"]
-            patience.succeeded()
+            limit.succeeded()
         elif asked:  # not after a part alone: most of it may have arrived
-            patience.check()
+            limit.check()
     upload_id: str = state["id"]
     return upload_id

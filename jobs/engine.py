@@ -19,9 +19,9 @@ from dbos import DBOS, DBOSClient, DBOSConfig, DBOSPortableJSONSerializer, Enque
 from dbos import error as dbos_error
 from sqlalchemy import exc
 
-from jobs.at_work import AtWork
 from jobs.database_url import SQLITE_PREFIX, cannot_open, no_answer, with_connection_limits
 from jobs.job import JobConflict, JobState, Outcome
+from jobs.running_work import RunningWork
 
 # Queues, whose workflows have the same names.
 QUEUE = "train"
@@ -201,7 +201,7 @@ def executing(
     run: Callable[[str], Awaitable[Outcome]],
     deliver: Callable[[str, str, dict[str, Any], int], None],
     run_task: Callable[[str, str], Awaitable[Outcome]],
-) -> Iterator[AtWork]:
+) -> Iterator[RunningWork]:
     """Take jobs from the queue while the context lasts, `slots` at a time, and await `run(job_id)` for each.
 
     Yields what is at work: jobs, messages and tasks.
@@ -224,7 +224,7 @@ def executing(
     )
     DBOS(config=config)
 
-    at_work = AtWork()
+    running_work = RunningWork()
 
     @DBOS.step(name="run", preemptible=True)
     async def step(job_id: str) -> dict[str, Any]:
@@ -232,12 +232,12 @@ def executing(
 
     @DBOS.workflow(name=QUEUE)
     async def workflow(job_id: str) -> dict[str, Any]:
-        with at_work.doing(str(DBOS.workflow_id)):
+        with running_work.running(str(DBOS.workflow_id)):
             return await step(job_id)
 
     @DBOS.workflow(name=MESSAGES)
     def messages(message_id: str, job_id: str, content: dict[str, Any], attempt: int) -> None:
-        with at_work.doing(str(DBOS.workflow_id)):
+        with running_work.running(str(DBOS.workflow_id)):
             DBOS.run_step({"name": "deliver"}, deliver, message_id, job_id, content, attempt)
 
     @DBOS.step(name="task", preemptible=True)
@@ -246,7 +246,7 @@ def executing(
 
     @DBOS.workflow(name=TASKS)
     async def task(job_id: str, number: str) -> dict[str, Any]:
-        with at_work.doing(str(DBOS.workflow_id)):
+        with running_work.running(str(DBOS.workflow_id)):
             return await task_step(job_id, number)
 
     DBOS.listen_queues(list(_QUEUES))
@@ -255,7 +255,7 @@ def executing(
         DBOS.register_queue(QUEUE, worker_concurrency=slots, polling_interval_sec=POLL_S, on_conflict="always_update")
         DBOS.register_queue(MESSAGES, worker_concurrency=4, polling_interval_sec=POLL_S)
         DBOS.register_queue(TASKS, worker_concurrency=1, polling_interval_sec=POLL_S)
-        yield at_work
+        yield running_work
     finally:
         DBOS.destroy(destroy_registry=True)
 

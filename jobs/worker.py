@@ -17,13 +17,13 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Any, NoReturn
 
-from jobs.at_work import AtWork
 from jobs.child_process import GRACE_S, ChildProcess, ProcessExit
 from jobs.engine import Engine, executing
 from jobs.exit_code import OUT_OF_MEMORY, ExitCode
 from jobs.job import Attempt, JobError, JobNotFound, JobState, Outcome
 from jobs.lease import Leases, open_leases
 from jobs.queue import JobQueue
+from jobs.running_work import RunningWork
 from jobs.store import JobFolder, Store
 from jobs.webhooks import RETRY_AFTER_S, WebhookError, deliver
 
@@ -62,9 +62,9 @@ class Worker:
         if not leases.acquire(self.id):
             raise JobError(f"The lease of worker {self.id} is held by another process. Start the worker again.")
         try:
-            with executing(self._url, self.id, self._slots, self._work, self._deliver, self._do_task) as at_work:
+            with executing(self._url, self.id, self._slots, self._work, self._deliver, self._do_task) as running_work:
                 LOG.info("worker %s takes jobs: %d at a time, %d threads each", self.id, self._slots, self._threads)
-                self._supervise(engine, leases, at_work, stop)
+                self._supervise(engine, leases, running_work, stop)
                 self._stop_all()
             returned = self._return_jobs(engine)
         finally:
@@ -84,7 +84,7 @@ class Worker:
             return False
         return True
 
-    def _supervise(self, engine: Engine, leases: Leases, at_work: AtWork, stop: threading.Event) -> None:
+    def _supervise(self, engine: Engine, leases: Leases, running_work: RunningWork, stop: threading.Event) -> None:
         while True:
             try:
                 if not leases.renew(self.id):
@@ -96,7 +96,7 @@ class Worker:
                 self._tell_checkpoints([job_id for job_id, _ in trainers])
                 requeue_work_of_dead_workers(engine, leases, taken, self.id)
                 ours = {entry for entry, executor in taken.items() if executor == self.id}
-                self._requeue_forgotten(engine, ours - at_work.ids())
+                self._requeue_forgotten(engine, ours - running_work.ids())
                 for job_id, trainer in trainers:
                     if taken.get(job_id) != self.id and not trainer.stopping:
                         LOG.warning("job %s was cancelled or given to another worker: stopping its trainer", job_id)

@@ -65,8 +65,8 @@ def create_app(settings: Settings) -> FastAPI:
     def limit(method: str, path: str) -> int:
         whole = method == "POST" and path in ("/jobs", "/plans", "/captures")
         part = method == "PUT" and path.startswith("/uploads/")
-        path_of_camera = method == "POST" and path.startswith("/jobs/") and path.endswith("/videos")
-        return settings.max_upload_mb * MB if whole or part else _CAMERA_PATH if path_of_camera else _SMALL_BODY
+        video = method == "POST" and path.startswith("/jobs/") and path.endswith("/videos")
+        return settings.max_upload_mb * MB if whole or part else _CAMERA_PATH if video else _SMALL_BODY
 
     app = Service(
         title="GrainGS",

@@ -24,10 +24,14 @@ class BodyLimit:
         request = Request(scope)
         most = self._limit(request.method, request.url.path)
         message = f"The body may have at most {most} bytes."
-        refusal = problem(request, 413, message, kind="too-large", headers=TooLarge.headers)
+
+        async def refuse() -> None:
+            response = problem(request, 413, message, kind="too-large", headers=TooLarge.headers)
+            await response(scope, receive, send)
+
         declared = request.headers.get("content-length", "")
         if declared.isdigit() and int(declared) > most:
-            await refusal(scope, receive, send)
+            await refuse()
             return
         received, answering = 0, False
 
@@ -46,6 +50,6 @@ class BodyLimit:
                 answering = True
                 await send(message)
             elif message["type"] == "http.response.start":
-                await refusal(scope, receive, send)
+                await refuse()
 
         await self._app(scope, counted, watched)

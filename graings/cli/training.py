@@ -74,7 +74,7 @@ def train(
                 raise
     interrupt = _take_steps(run)
     if run.iteration < run.iterations:
-        print_line(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations, {where_it_goes_on(run)}.")
+        print_line(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations, {kept_checkpoint(run)}.")
         print_line(f"Continue with: graings train --resume -o {run.folder}")
         raise typer.Exit(interrupt.exit_code)
     _print_result(run)
@@ -139,8 +139,8 @@ def ablate(
     print_line(f"The table is in {output / 'ablation.md'}, with ablation.json and ablation.svg beside it.")
 
 
-def where_it_goes_on(run: TrainingRun) -> str:
-    """Where a run that was stopped will go on."""
+def kept_checkpoint(run: TrainingRun) -> str:
+    """The checkpoint from which a run that was stopped continues, in words."""
     newest = newest_checkpoint(run.folder)
     if newest is None or int(newest.name) == run.iteration:
         return "at a checkpoint"

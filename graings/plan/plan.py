@@ -16,7 +16,7 @@ from graings.document import Document
 from graings.plan.capture_statistics import CaptureStatistics
 from graings.plan.cost import Calibration, Prediction, predict
 from graings.plan.decision import Component, Decision, Saving
-from graings.plan.rules import contradictions, decide, rate_of_preset
+from graings.plan.rules import contradictions, decide, has_preset_rate
 
 # DeformNet also helps children to find their place. Without it, three captures of one time gain 0.15 to 0.18 dB with
 # twice the first rate of the child offsets (docs/experiments/training-speed.md).
@@ -75,7 +75,7 @@ def without(config: TrainConfig, components: Sequence[Component]) -> TrainConfig
     if "deformation" in components and config.scene.deformation != "none":
         scene["deformation"] = "none"
         first, last = config.rates.offsets
-        if rate_of_preset(config):
+        if has_preset_rate(config):
             rates["offsets"] = OFFSETS_FACTOR * first, last
     if "residual" in components:
         scene["residual"] = False

@@ -43,7 +43,7 @@ def decide(statistics: CaptureStatistics, config: TrainConfig) -> list[Decision]
     ]
 
 
-def rate_of_preset(config: TrainConfig) -> bool:
+def has_preset_rate(config: TrainConfig) -> bool:
     """Whether the child offsets have the rate of the preset: one that was set is the user's decision."""
     return config.rates.offsets == make_config(config.preset).rates.offsets
 
@@ -109,7 +109,7 @@ def _deformation(statistics: CaptureStatistics, config: TrainConfig) -> Decision
         return _kept_by_option(config, "deformation", one if one.holds else still)
     if one.holds:
         reason = "1 distinct training time: the canonical state is all there is"
-        reason += "; offsets start at twice their rate" if rate_of_preset(config) else ""
+        reason += "; offsets start at twice their rate" if has_preset_rate(config) else ""
         return _dropped("deformation", "representable", reason, one)
     if statistics.change is None:
         reason = MONOCULAR if statistics.camera_motion != "fixed" else "not every fixed camera could be looked at"

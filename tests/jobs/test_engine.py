@@ -116,7 +116,7 @@ def test_a_job_can_be_cancelled_requeued_and_rewound_but_runs_under_its_own_limi
 
 
 @pytest.mark.slow(reason="waits for the polls of a queue")
-def test_a_job_that_is_taken_again_while_its_last_run_stops_is_at_work_until_both_end(engine: Engine) -> None:
+def test_a_job_that_is_taken_again_while_its_last_run_stops_is_running_work_until_both_end(engine: Engine) -> None:
     began: list[int] = []
     ended: list[int] = []
     stop_first = False
@@ -132,7 +132,7 @@ def test_a_job_that_is_taken_again_while_its_last_run_stops_is_at_work_until_bot
         raise AssertionError("unreachable: only cancellation ends the wait")
 
     engine.enqueue("a", 10)
-    with executing(engine.url, "worker-a", 2, run, deliver, do_task) as at_work:
+    with executing(engine.url, "worker-a", 2, run, deliver, do_task) as running_work:
         until(lambda: began == [0])
         engine.cancel("a")
         time.sleep(2.5)  # the run is cancelled within two seconds
@@ -141,7 +141,7 @@ def test_a_job_that_is_taken_again_while_its_last_run_stops_is_at_work_until_bot
         stop_first = True
         until(lambda: ended == [0])
         time.sleep(0.2)
-        assert at_work.ids() == {"a"}
+        assert running_work.ids() == {"a"}
         assert state(engine, "a") is JobState.RUNNING
 
 
@@ -215,13 +215,13 @@ def test_work_whose_end_cannot_be_recorded_is_known_and_can_be_put_back(
         with closing(sqlite3.connect(tmp_path / "jobs.sqlite", timeout=30)) as database, database:
             database.execute(statement)
 
-    with executing(engine.url, "worker-a", 1, run, deliver, run) as at_work:
+    with executing(engine.url, "worker-a", 1, run, deliver, run) as running_work:
         enqueue(engine)
-        until(lambda: runs == 1 and not at_work.ids())
+        until(lambda: runs == 1 and not running_work.ids())
         time.sleep(1.0)
         refuse("drop trigger full")
         assert engine.taken() == {"a": "worker-a"}
         assert engine.taken("worker-b") == {}
         engine.put_back(engine.taken("worker-a"))
         until(lambda: state(engine, "a") is JobState.SUCCEEDED)
-        assert (runs, engine.taken(), at_work.ids()) == (2, {}, frozenset())
+        assert (runs, engine.taken(), running_work.ids()) == (2, {}, frozenset())

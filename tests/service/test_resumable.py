@@ -17,7 +17,7 @@ import pytest
 import uvicorn
 from starlette.testclient import TestClient
 
-from client import Client, ClientError, calls, patience
+from client import Client, ClientError, calls, retry_limit
 from client import captures as sending
 from service.app import create_app
 from service.keys import Keys, Scope
@@ -297,7 +297,7 @@ def test_the_client_continues_over_a_connection_that_breaks(
         job = remote.submit(capture, preset="draft")
         assert (job.state, flaky.left) == ("queued", 0)
         assert len(list((settings.data / "captures").rglob("*.png"))) == len(list(capture.rglob("*.png")))
-        monkeypatch.setattr(patience, "PATIENCE_S", 0.5)
+        monkeypatch.setattr(retry_limit, "RETRY_FOR_S", 0.5)
         flaky.left, flaky.allowed = 10_000, 0
         with pytest.raises(ClientError, match="does not answer"):
             remote.upload(capture)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from graings.cli.training import where_it_goes_on
+from graings.cli.training import kept_checkpoint
 from graings.errors import CheckpointError, DivergedError
 from graings.evaluation.evaluate import evaluate
 from graings.render import render
@@ -158,7 +158,7 @@ def test_a_diverging_scene_is_not_saved_so_that_a_resumed_run_returns_to_a_healt
     assert run.save().name == kept[-1]
     assert [one.name for one in checkpoints(folder)] == kept
     where = f"iteration {int(kept[-1])}," if int(kept[-1]) < 12 else "at a checkpoint"
-    assert where in where_it_goes_on(run)
+    assert where in kept_checkpoint(run)
     assert TrainingRun.resume(folder, threads=1).iteration == int(kept[-1])
 
 

@@ -1,4 +1,4 @@
-"""AtWork: the jobs, messages and tasks that a worker is doing."""
+"""RunningWork: the jobs, messages and tasks that a worker runs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 
-class AtWork:
-    """Ids of what is being done. Thread-safe.
+class RunningWork:
+    """Ids of the work that is running. Thread-safe.
 
     A job that was cancelled and resumed is taken again while its last run still stops: runs are counted.
     """
@@ -19,7 +19,7 @@ class AtWork:
         self._lock = threading.Lock()
 
     @contextmanager
-    def doing(self, entry: str) -> Iterator[None]:
+    def running(self, entry: str) -> Iterator[None]:
         """A context that is one run of `entry`."""
         with self._lock:
             self._runs[entry] += 1

@@ -11,7 +11,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from client import AsyncClient, Client, ClientError, RefusedError, asynchronous, blocking, calls, patience
+from client import AsyncClient, Client, ClientError, RefusedError, asynchronous, blocking, calls, retry_limit
 from client.captures import uploading
 
 END = 'id: 3\nevent: end\ndata: {"state": "succeeded"}\n\n'
@@ -35,7 +35,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     async def asleep(seconds: float) -> None:
         clock.sleep(seconds)
 
-    monkeypatch.setattr(patience.time, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(retry_limit.time, "monotonic", lambda: clock.now)
     monkeypatch.setattr(blocking.time, "sleep", clock.sleep)
     monkeypatch.setattr(asynchronous.asyncio, "sleep", asleep)
     return clock
