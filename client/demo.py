@@ -79,7 +79,8 @@ def _train(url: str, client: Client, folder: Path, console: Console) -> str:
     """Submit the capture and wait for the end of the job; returns its id."""
     capture = folder / SCENE
     if not capture.exists():
-        _draw_capture(capture)
+        with console.status(f"drawing {VIEWS} training images of {SCENE}"):
+            _draw_capture(capture)
     console.print(f"Capture: {capture} ({VIEWS} training images of {SIZE} px)")
     job = client.submit(capture, preset=PRESET, config=OPTIONS)
     console.print(f"Job:     {url}/jobs/{job.id}")
@@ -110,7 +111,8 @@ def _draw_capture(capture: Path) -> None:
     part = capture.with_suffix(".part")  # renamed when complete, so that a partial capture is not used
     shutil.rmtree(part, ignore_errors=True)
     command = [*GRAINGS, "synthesize", SCENE, "-o", str(part), "--size", str(SIZE), "--views", str(VIEWS)]
-    if subprocess.run(command).returncode != 0:
+    # Its output names a next command with the folder as it is called until it is renamed; errors are shown.
+    if subprocess.run(command, stdout=subprocess.DEVNULL).returncode != 0:
         raise DemoError("the synthetic capture could not be drawn")
     part.rename(capture)
 
