@@ -92,9 +92,9 @@ class JobSpec:
     webhook: str | None = None
     webhook_secret: str | None = None
 
-    def extended(self, iterations: int) -> JobSpec:
-        """The same with so many more iterations."""
-        return replace(self, config={**self.config, "iterations": self.config["iterations"] + iterations})
+    def trained_for(self, iterations: int) -> JobSpec:
+        """The same with so many iterations in all."""
+        return replace(self, config={**self.config, "iterations": iterations})
 
 
 @dataclass(frozen=True, slots=True)

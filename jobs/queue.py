@@ -157,11 +157,13 @@ class JobQueue:
             if job.state is not JobState.SUCCEEDED:
                 raise JobConflict(f"Job {job_id} is {job.state}; only one that has succeeded can be extended.")
             folder = self.store.folder(job_id)
-            folder.write_spec(job.spec.extended(iterations))
+            # Counted from what was trained: a process that died between the two writes below has left a longer
+            # specification, and the request that repeats it must not extend the job twice.
+            trained = folder.checkpoint() or job.spec.config["iterations"]
+            folder.write_spec(job.spec.trained_for(trained + iterations))
             try:
                 self._engine.rewind(job_id)
             except BaseException:
-                # The client gets an error and will ask again, which must not extend the job twice.
                 folder.write_spec(job.spec)
                 raise
         return self.get(job_id)

@@ -29,7 +29,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "graings.camera": (),
     "graings.kernel": (),
     "graings.capture": ("graings.camera", "graings.config"),
-    "graings.footage": ("graings.storage.files", "graings.storage.locks"),
+    "graings.footage": ("graings.capture.load", "graings.storage.files", "graings.storage.locks"),
     "graings.scene": ("graings.camera", "graings.config", "graings.kernel"),
     "graings.raster": ("graings.camera", "graings.kernel"),
     "graings.render": ("graings.camera", "graings.raster", "graings.scene"),  # they meet here and nowhere else

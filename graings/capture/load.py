@@ -46,6 +46,11 @@ def load_capture(path: Path, config: CaptureConfig | None = None) -> Capture:
     return normalize(raw, root=root, max_side=config.max_side, content_hash=folder.digest())
 
 
+def holds_capture(path: Path) -> bool:
+    """Whether the folder `path` itself has the files of a capture, complete or not."""
+    return _reader(path) is not None
+
+
 def find_capture(path: Path) -> tuple[Path, Reader]:
     """The folder of the capture at or below `path`, the one least deep, and its reader. Raises `CaptureError`."""
     level, incomplete = [path], None

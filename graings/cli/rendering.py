@@ -18,6 +18,7 @@ from graings.export.shown import open_shown
 from graings.image_encoding import image_format
 from graings.kernel import use_threads
 from graings.render import FastScene, PreparedScene, render
+from graings.storage.files import check_writable, write_bytes
 
 RenderPath = Annotated[
     Path,
@@ -80,6 +81,7 @@ def render_view(
     try:
         format = image_format(output.suffix)
         check_content(show, format)
+        check_writable(output)
         request = ViewRequest(
             camera=camera,
             azimuth=azimuth,
@@ -109,7 +111,7 @@ def render_view(
     started = perf_counter()
     image = picture(scene, view, time, rgb, shown.units, show, format)
     milliseconds = 1e3 * (perf_counter() - started)
-    output.write_bytes(image)
+    write_bytes(output, image)
     print_line(f"{output}: {view.width} x {view.height} at t = {time:g}, rendered in {milliseconds:.0f} ms.")
     if approximation is not None:
         similarity = psnr(render(scene, view, time, rgb).color, exact)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from graings.capture.load import holds_capture
 from graings.colmap import import_pycolmap
 from graings.document import read_document
 from graings.errors import CaptureError
@@ -88,7 +89,7 @@ def _check_target(source: Path, target: Path, made: Path) -> None:
     """Raise `CaptureError` where the capture would be written over files, or among those it is made of."""
     if target.exists() and not target.is_dir():
         raise CaptureError("is a file, not a folder", file=target, remedy="Choose another folder.")
-    if (target / TRANSFORMS).exists():
+    if target.is_dir() and holds_capture(target):
         raise CaptureError("holds a capture already", file=target, remedy="Choose another folder.")
     workspace, there = target / WORKSPACE, source.resolve()
     if workspace.exists() and any(workspace.iterdir()) and not (workspace / LOCK_FILE).exists():

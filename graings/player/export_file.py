@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
-from graings.errors import CheckpointError
 from graings.export.export import (
     FRAMES,
     MODEL,
@@ -21,7 +19,7 @@ from graings.export.selection import Selection
 from graings.player.html import player_html
 from graings.player.scene_file import read_scene, scene_bytes
 from graings.storage.compact import write_compact
-from graings.storage.files import write_bytes
+from graings.storage.files import check_writable, write_bytes
 from graings.storage.model import Model
 from graings.storage.model import scene_bytes as model_bytes
 
@@ -42,25 +40,12 @@ def export_request(
     """
     format, selection = export_format(path), selection or Selection()
     check_used(format, time=time, frames=frames, degree=degree)
-    _check_place(path)
+    check_writable(path)
     if format not in WHOLE:
         return ExportRequest(format, time or 0.0, FRAMES if frames is None else frames, degree, selection)
     if selection != Selection():
         raise ValueError(f"a .{format} file holds the whole scene; a box, a sphere and `seen` are for splats")
     return None
-
-
-def _check_place(path: Path) -> None:
-    """Raises `CheckpointError` where `path` is a folder, or is in none that can be written to."""
-    if path.is_dir():
-        raise CheckpointError(f"{path}: is a folder where a file is wanted. Name a file in it.")
-    if not path.parent.is_dir():
-        raise CheckpointError(f"{path}: there is no folder {path.parent}. Make it, or name another place.")
-    try:
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be written ({error.strerror}). Name another place.") from error
 
 
 def export_file(model: Model, path: Path, request: ExportRequest | None) -> str:

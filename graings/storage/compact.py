@@ -26,7 +26,7 @@ from graings.errors import CheckpointError
 from graings.scene.scaffold import Scaffold, per_slot
 from graings.scene.scene import Scene
 from graings.storage.checkpoint import load_model
-from graings.storage.files import write_bytes
+from graings.storage.files import check_writable, write_bytes
 from graings.storage.model import DAMAGE, Model, model_facts, model_from
 from graings.storage.run_folder import newest_model
 
@@ -48,6 +48,7 @@ def write_compact(model: Model, path: Path) -> int:
 
     Raises `CheckpointError` where the file cannot be written.
     """
+    check_writable(path)
     tensors = {name: tensor.detach() for name, tensor in model.scene.state_dict().items()}
     for name in _HALVED:
         halved = tensors[f"scaffold.{name}"].half()
@@ -74,8 +75,6 @@ def write_compact(model: Model, path: Path) -> int:
     # One metadata entry, because the library writes several in random order.
     data = save(plain, {_FACTS: json.dumps({"format": FORMAT, **facts}, allow_nan=False)})
     packed = gzip.compress(data, mtime=0)
-    if not path.name or path.is_dir():
-        raise CheckpointError(f"{path}: is a folder where a file is wanted. Name a file in it.")
     try:
         write_bytes(path, packed)
     except OSError as error:

@@ -45,10 +45,13 @@ def test_an_option_that_a_format_does_not_use_is_refused(format: str, name: str,
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("format", [*FORMATS, *WHOLE])
+@pytest.mark.parametrize(
+    ("command", "format"),
+    [*(("export", format) for format in (*FORMATS, *WHOLE)), ("render", "png"), ("render", "exr")],
+)
 @pytest.mark.parametrize("place", ["missing", "a file", "a folder"])
 def test_a_place_where_no_file_can_be_is_refused_before_the_model_is_read(
-    format: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, format: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "there" / f"a.{format}"
     if place == "a file":
@@ -56,7 +59,7 @@ def test_a_place_where_no_file_can_be_is_refused_before_the_model_is_read(
     elif place == "a folder":
         output.mkdir(parents=True)
     with pytest.raises(SystemExit) as ended:
-        main(["export", str(tmp_path / "absent"), "-o", str(output)])
+        main([command, str(tmp_path / "absent"), "-o", str(output)])
     assert ended.value.code == 65
     message = capsys.readouterr().err
     assert message.startswith(f"{output}: ")

@@ -104,11 +104,15 @@ def link_to_the_photographs(root: Path) -> tuple[Path, Path]:
     return root / "photos", root / "c"
 
 
-def colmap_folder(root: Path) -> tuple[Path, Path]:
-    photos(root / "scene/images")
+def colmap_model_alone(root: Path) -> tuple[Path, Path]:
     (root / "scene/sparse/0").mkdir(parents=True)
     (root / "scene/sparse/0/cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24")
     return photos(root / "photos"), root / "scene"
+
+
+def colmap_folder(root: Path) -> tuple[Path, Path]:
+    photos(root / "scene/images")
+    return colmap_model_alone(root)
 
 
 def folder_with(name: str) -> Callable[[Path], tuple[Path, Path]]:
@@ -138,7 +142,11 @@ REFUSED: dict[str, tuple[Callable[[Path], tuple[Path, Path]], str]] = {
     "holiday -o holiday, photographs in it": (the_target_itself, "lies where the capture .* would be written"),
     "holiday/images -o link": (through_a_link, "lies where the capture .* would be written"),
     "photos -o c, c/images is a link to photos": (link_to_the_photographs, "lies where the capture .* would be"),
-    "photos -o scene of COLMAP": (colmap_folder, "holds images already"),
+    "photos -o scene of COLMAP": (colmap_folder, "holds a capture already"),
+    "photos -o model of COLMAP without images": (colmap_model_alone, "holds a capture already"),
+    "photos -o c with transforms_train.json": (folder_with("transforms_train.json"), "holds a capture already"),
+    "photos -o c with transforms_test.json": (folder_with("transforms_test.json"), "holds a capture already"),
+    "photos -o c with poses_bounds.npy": (folder_with("poses_bounds.npy"), "holds a capture already"),
     "photos -o c with images": (folder_with("images"), "holds images already"),
     "photos -o c with points.ply": (folder_with("points.ply"), r"holds points\.ply already"),
     "photos -o c with footage.json": (folder_with("footage.json"), r"holds footage\.json already"),

@@ -70,7 +70,7 @@ CHANGES: dict[str, tuple[Callable[[JobQueue, JobFolder], object], Callable[[Job]
     "an attempt": (lambda _, folder: folder.begin_attempt("other"), lambda job: job.attempts == 2),
     "it waits again": (lambda jobs, folder: jobs.resume(folder.path.name), lambda job: job.state is JobState.QUEUED),
     "more iterations": (
-        lambda _, folder: folder.write_spec(folder.spec().extended(7)),
+        lambda _, folder: folder.write_spec(folder.spec().trained_for(12)),
         lambda job: job.spec.config["iterations"] == 12,
     ),
     "a damaged file": (lambda _, folder: (folder.path / "job.json").write_text("{"), lambda job: job.error is not None),

@@ -141,7 +141,7 @@ def test_an_extended_job_goes_on_from_its_last_checkpoint(tmp_path: Path) -> Non
     folder.begin_attempt("worker")
     with trainer(folder) as process:
         assert process.wait(60) == ExitCode.DONE
-    folder.write_spec(folder.spec().extended(10))
+    folder.write_spec(folder.spec().trained_for(22))
     with trainer(folder) as process:
         assert process.wait(60) == ExitCode.DONE
     model, last = load_model(folder.run), last_progress(folder.progress)
