@@ -6,8 +6,9 @@ import statistics
 from collections import deque
 from typing import Final
 
-from graings.plan.decision import Decision, Saving
+from graings.plan.decision import Component, Decision, Saving
 from graings.plan.plan import Plan
+from graings.plan.rules import QUIET_GROWTHS
 from graings.plan.tile_change import HALF_LEVEL
 from graings.report.events import Event, GrowthQuiet, PartDropped
 from graings.storage.files import write_document
@@ -43,6 +44,21 @@ class PlanRevision:
             if isinstance(event, GrowthQuiet):
                 self._note_growth(event)
 
+    def return_to(self, trainer: Trainer) -> None:
+        """Training went back to an earlier scene: what it has left out since then is there again, and in the plan."""
+        there: dict[Component, bool] = {
+            "residual": trainer.scene.residual is not None,
+            "growth": trainer.quiet_growths < QUIET_GROWTHS,
+        }
+        for component, present in there.items():
+            planned, decision = self._planned.decision(component), self.plan.decision(component)
+            if present and planned is not None and decision is not None and decision.decision != planned.decision:
+                self.log.plan = self.plan.revised(planned)
+                if component == "residual":
+                    self.log.residual_unseen, self._before = 0, None
+        with self.log.clock.timed("report"):
+            self.write()
+
     def begin_again(self) -> None:
         """Training starts again: what it has found was about the scene before."""
         self.log.plan = self._planned
@@ -66,7 +82,6 @@ class PlanRevision:
         return events
 
     def _judge_residual(self, trainer: Trainer, iteration: int) -> tuple[Event, ...]:
-        # As planned: a rollback may have brought back a residual that the plan had left out.
         decision = self._planned.decision("residual")
         if decision is None or decision.kind != "bounded" or trainer.scene.residual is None:
             return ()

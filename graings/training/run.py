@@ -20,7 +20,7 @@ from graings.kernel import computing_threads
 from graings.plan.capture_statistics import measure
 from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan, make_plan
-from graings.report.events import Diverged, Event
+from graings.report.events import Diverged, Event, RolledBack
 from graings.report.metrics_document import EvaluationPoint
 from graings.report.run_record import read_record
 from graings.storage.checkpoint import intact, load_training, newest_checkpoint
@@ -183,8 +183,8 @@ class TrainingRun:
             self.log.clock.add(step.phase, step.seconds, step.cpu_s)
             self.log.gaussians = step.gaussians
             rate.add(step.seconds)
-            self.log.note(step.events)
             self.revision.note(step)
+            self._note(step.events)
             last = step.iteration == self.iterations
             saving = step.iteration % self.config.evaluation.checkpoint_every == 0
             evaluating = step.iteration in evaluation_marks(self.config, self.iterations)
@@ -228,8 +228,13 @@ class TrainingRun:
 
     def _check(self) -> tuple[Event, ...]:
         events = tuple(self._trainer.check())
-        self.log.note(events)
+        self._note(events)
         return events
+
+    def _note(self, events: tuple[Event, ...]) -> None:
+        self.log.note(events)
+        if any(isinstance(event, RolledBack) for event in events):
+            self.revision.return_to(self._trainer)
 
     def _restart_if_motion_is_missing(self) -> tuple[Event, ...]:
         """Once, after part of the steps: restart with what helps to find a moving object that is missing.
@@ -287,6 +292,7 @@ class TrainingRun:
         self.log.note([Diverged(iteration=self.iteration, reason=reason)])
         self.log.diverged = reason
         self.output.return_to_best(trainer, self._best_psnr)
+        self.revision.return_to(trainer)
         splits = self.output.splits(trainer)
         self._save(instead_of_later=True)
         compact, stiffness = self.output.export(trainer), self.output.stiffness(trainer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 import torch
 
 from graings.capture.synthetic import write_synthetic
+from graings.errors import DivergedError
 from graings.plan.capture_statistics import measure
 from graings.plan.plan import make_plan
 from graings.plan.rules import QUIET_GROWTHS
 from graings.plan.tile_change import HALF_LEVEL
 from graings.render import render
-from graings.report.events import GrowthQuiet, PartDropped, Restarted
+from graings.report.events import Diverged, GrowthQuiet, PartDropped, Restarted, RolledBack
 from graings.report.metrics_document import read_metrics
 from graings.report.run_record import read_plan
 from graings.scene.scene import Scene
@@ -206,6 +208,31 @@ def test_the_plan_on_disk_is_that_of_the_checkpoint_once_a_killed_run_goes_on(ca
     plan = read_plan(tmp_path / "run")
     assert plan is not None
     assert not plan.drops("residual")
+
+
+@pytest.mark.parametrize("diverged", [False, True])
+def test_the_plan_is_that_of_the_scene_to_which_training_went_back(
+    capture: Path, tmp_path: Path, diverged: bool
+) -> None:
+    """Rolled back to a snapshot, or to the best model, of before the residual was left out; then at the end too."""
+    limits = {"guard.rollbacks": 0} if diverged else {}
+    run = TrainingRun.create(capture, tmp_path / "run", micro_config(**OFTEN, **FROZEN, **limits))
+    with pytest.raises(DivergedError) if diverged else nullcontext():
+        for report in run:
+            rolled_back = any(isinstance(event, RolledBack) for event in run.log.events)
+            if not rolled_back and any(isinstance(event, PartDropped) for event in report.events):
+                with torch.no_grad():
+                    run.trainer.scene.scaffold.features[0] = torch.nan
+            plan = read_plan(tmp_path / "run")
+            assert plan is not None
+            assert plan.drops("residual") == (run.trainer.scene.residual is None)
+    events = read_metrics(tmp_path / "run" / "metrics.json").events
+    assert [type(event) for event in events].index(PartDropped) < [type(event) for event in events].index(
+        Diverged if diverged else RolledBack
+    )
+    plan = read_plan(tmp_path / "run")
+    assert plan is not None
+    assert plan.drops("residual") == (load_model(tmp_path / "run").scene.residual is None)
 
 
 def test_a_restart_judges_the_residual_of_the_new_scene_anew(
