@@ -66,8 +66,8 @@ ROWS = (
     ),
     Row(
         "curriculum",
-        "time window, guard that rolls back, background of the capture",
-        ("time_window", "guard", "capture.background"),
+        "time window, guard that rolls back, background of the capture, plan",
+        ("time_window", "guard", "capture.background", "plan"),
     ),
 )
 

@@ -104,12 +104,16 @@ class AsyncClient:
                     if not stream.response.is_success:
                         await stream.response.aread()
                         calls.read(stream.response, lambda response: None)
-                    limit.succeeded()
+                    empty = True
                     async for event in stream:
+                        limit.succeeded()
+                        empty = False
                         after = event.id or after
                         yield Event(event.event, event.json())  # type: ignore[arg-type]
                         if event.event == "end":
                             return
+                    if empty:
+                        limit.failed(ClientError(calls.no_events(self._http.base_url)))
             except httpx2.TransportError as error:
                 limit.failed(ClientError(calls.no_answer(self._http.base_url, error)))
             except RefusedError as error:

@@ -103,12 +103,16 @@ class Client:
                     if not stream.response.is_success:
                         stream.response.read()
                         calls.read(stream.response, lambda response: None)
-                    limit.succeeded()
+                    empty = True
                     for event in stream:
+                        limit.succeeded()
+                        empty = False
                         after = event.id or after
                         yield Event(event.event, event.json())  # type: ignore[arg-type]
                         if event.event == "end":
                             return
+                    if empty:
+                        limit.failed(ClientError(calls.no_events(self._http.base_url)))
             except httpx2.TransportError as error:
                 limit.failed(ClientError(calls.no_answer(self._http.base_url, error)))
             except RefusedError as error:

@@ -65,6 +65,11 @@ def no_answer(url: httpx2.URL, error: Exception) -> str:
     return f"{url} does not answer: {error or type(error).__name__}. Is the service running there?"
 
 
+def no_events(url: httpx2.URL) -> str:
+    """What to say when a stream of events ends before the first, which the service sends at once."""
+    return f"{url} closes its streams of events at once. Is there a proxy in between that does not pass them on?"
+
+
 def submit(
     upload_id: str, name: str, preset: str, config: Query | None, priority: int, webhook: str | None, key: str
 ) -> Call[RemoteJob]:

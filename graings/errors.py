@@ -4,6 +4,7 @@
     ├── CaptureError      a file of the capture is missing, broken or contradicts another
     ├── ConfigError       an option is unknown or out of range
     ├── CheckpointError   a run folder or checkpoint cannot be read or written
+    ├── OutputError       no file can be written at the place that was named
     ├── KernelError       the compiled kernel is absent or cannot run on this CPU
     └── DivergedError     training cannot continue; the best model is kept as the newest checkpoint
 
@@ -55,6 +56,10 @@ class CaptureError(GraingsError):
 
 class ConfigError(GraingsError):
     """An option is unknown, of the wrong type or out of range."""
+
+
+class OutputError(GraingsError):
+    """No file can be written at the place that was named."""
 
 
 class CheckpointError(GraingsError):

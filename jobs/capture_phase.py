@@ -31,7 +31,7 @@ def capture_of(
 ) -> tuple[Path, list[str]]:
     """The capture to train on: `upload` itself, or what is made of its footage or recipe; and lines for the log.
 
-    An interrupted call continues where it was; a synthetic scene, which takes seconds, begins again. `phase_s` are the
+    What is made is kept. An interrupted call continues where it was; a synthetic scene begins again. `phase_s` are the
     seconds of the job in each phase, to which those of this one are added. Raises `Stopped` when `stop` is set, and
     `CaptureError` where the footage does not hold together.
     """
@@ -39,7 +39,7 @@ def capture_of(
     footage = None if recipe else find_footage(upload)
     if recipe is None and footage is None:
         return upload, []
-    if (folder.capture / TRANSFORMS).exists():
+    if (folder.capture if recipe else folder.capture / TRANSFORMS).exists():
         return folder.capture, []
     attempts = folder.attempts()
     changed = time.monotonic()
@@ -68,14 +68,16 @@ def capture_of(
             raise Stopped
 
     if recipe is not None:
-        shutil.rmtree(folder.capture, ignore_errors=True)  # of a trainer that was killed
+        part = folder.path / "capture.part"  # renamed when it is complete: a job may be extended after it has ended
+        shutil.rmtree(part, ignore_errors=True)  # of a trainer that was killed
         # In this process: those of a pool would outlive a trainer that is killed.
         synthesize(
             recipe.scene,
-            folder.capture,
+            part,
             **recipe.model_dump(exclude={"scene"}),
             observe=lambda done, total: observe("drawing", done, total),
         )
+        part.rename(folder.capture)
         book()
         return folder.capture, [f"drew the synthetic scene {recipe.scene}"]
     assert footage is not None

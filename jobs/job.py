@@ -11,7 +11,7 @@
                │  │
                │  └──────▶ failed, diverged ── retry ──▶ queued
                ▼
-           succeeded
+           succeeded ── extend ──▶ queued
 
 The last checkpoint is always kept, and a job that is queued again continues from it.
 """

@@ -1,4 +1,4 @@
-"""JobQueue: submit, inspect, cancel, resume, retry and delete jobs.
+"""JobQueue: submit, inspect, cancel, resume, retry, extend and delete jobs.
 
 Combines the entry of a job in the queue (`jobs.engine`) with its files on disk (`jobs.store`), and checks which
 operations its state allows. It has no state of its own but what it has read: any number of processes may have one.
@@ -15,6 +15,7 @@ from pathlib import Path
 from time import time
 from typing import Any, Final
 
+from graings.config import make_config
 from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, MODEL_FILE, PLAN_FILE
 from jobs.engine import Engine, QueueEntry
 from jobs.job import Attempt, Job, JobConflict, JobDamaged, JobNotFound, JobSpec, JobState
@@ -147,20 +148,26 @@ class JobQueue:
         elif job.state is JobState.CANCELLED:
             raise JobConflict(f"Job {job_id} was cancelled, it did not fail. Use resume.")
         elif job.state is JobState.SUCCEEDED:
-            raise JobConflict(f"Job {job_id} has succeeded; there is nothing to retry. Submit a new job.")
+            raise JobConflict(f"Job {job_id} has succeeded; there is nothing to retry. Extend it.")
         return self.get(job_id)
 
     def extend(self, job_id: str, iterations: int) -> Job:
-        """Enqueue a job that has succeeded again, to train for so many more iterations."""
+        """Enqueue a job that has succeeded again, to train for so many more iterations.
+
+        Raises `JobConflict` in any other state, `ConfigError` for more iterations in all than a job may have, and
+        `JobDamaged` where the record of its run cannot be read.
+        """
         with self.store.changing():  # of two requests at once, one finds the job in the queue
             job = self.get(job_id)
             if job.state is not JobState.SUCCEEDED:
                 raise JobConflict(f"Job {job_id} is {job.state}; only one that has succeeded can be extended.")
             folder = self.store.folder(job_id)
-            # Counted from what was trained: a process that died between the two writes below has left a longer
-            # specification, and the request that repeats it must not extend the job twice.
-            trained = folder.checkpoint() or job.spec.config["iterations"]
-            folder.write_spec(job.spec.trained_for(trained + iterations))
+            # Counted from the record of the run, which follows the specification when the trainer starts: a process
+            # that died between the two writes below has left a longer specification, and the request that repeats it
+            # must not extend the job twice.
+            longer = job.spec.trained_for(folder.trained_iterations() + iterations)
+            make_config(overrides=longer.config)  # raises where the sum is out of range
+            folder.write_spec(longer)
             try:
                 self._engine.rewind(job_id)
             except BaseException:

@@ -1,7 +1,7 @@
 """Store: captures and jobs on disk.
 
     <root>/captures/<sha256>/    an unpacked capture, shared by all jobs that use it
-    <root>/jobs/<id>/            job.json, attempts.json, progress.jsonl, log.txt, lock, tasks/<id>/, run/ (the run)
+    <root>/jobs/<id>/            job.json, attempts.json, progress.jsonl, log.txt, locks, tasks/<id>/, run/ (the run)
     <root>/submissions/          the job of each idempotency key, as a link
     <root>/uploads/              archives that are being uploaded or unpacked
     <root>/workers/              leases of workers on this machine
@@ -25,7 +25,7 @@ from pathlib import Path
 
 from graings.storage.files import sync, sync_tree, write_json
 from graings.storage.locks import locked
-from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, MODEL_FILE, PLAN_FILE, newest_checkpoint
+from graings.storage.run_folder import CURVE_FILE, METRICS_FILE, MODEL_FILE, PLAN_FILE, RECORD_FILE, newest_checkpoint
 from jobs.job import (
     Attempt,
     CaptureNotFound,
@@ -127,6 +127,15 @@ class JobFolder:
         """The iteration of the newest checkpoint, or None."""
         newest = newest_checkpoint(self.run)
         return None if newest is None else int(newest.name)
+
+    def trained_iterations(self) -> int:
+        """The iterations for which the run is configured, as its record says; a restart adds to them."""
+        file = self.run / RECORD_FILE
+        try:
+            return int(json.loads(file.read_text())["config"]["iterations"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            remedy = "Delete the job and submit its capture again."
+            raise JobDamaged(f"{file}: not readable ({error!r}). {remedy}") from error
 
     def attempts(self) -> list[Attempt]:
         """The last `KEPT_ATTEMPTS` starts of the trainer, oldest first."""

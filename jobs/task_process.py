@@ -25,13 +25,15 @@ from graings.export.video import write_video
 from graings.kernel import use_threads
 from graings.report.evaluate_run import evaluate_run
 from graings.storage.locks import locked
+from jobs.child_process import GRACE_S
 from jobs.exit_code import ExitCode
 from jobs.parent import watch_parent
 from jobs.store import JobFolder, Store
 from jobs.task import EvaluationSpec, TaskFolder, VideoSpec
 
 REPORT_EVERY_S = 0.5
-LOCK_WAIT_S = 10.0  # for a trainer that is about to end; one that trains would block all tasks of the worker for hours
+# For a trainer that was asked to stop; one that trains would block all tasks of the worker for hours.
+LOCK_WAIT_S = GRACE_S + 15.0
 
 
 class Ended(BaseException):
@@ -70,15 +72,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _evaluate(folder: JobFolder, spec: EvaluationSpec) -> None:
     capture = Store(folder.path.parent.parent).trained_on(folder.path.name)
-    deadline = time.monotonic() + LOCK_WAIT_S
-    while True:
-        with locked(folder.lock, wait=False) as free:  # a trainer writes the same metrics
-            if free:
-                evaluate_run(folder.run, spec.split, capture)
-                return
-        if time.monotonic() >= deadline:
-            raise CheckpointError(f"Job {folder.path.name} is being trained. Evaluate it when it has ended.")
-        time.sleep(0.2)
+    with locked(folder.path / "evaluation.lock"):  # one evaluation after the other
+        deadline = time.monotonic() + LOCK_WAIT_S
+        while True:
+            with locked(folder.lock, wait=False) as free:  # a trainer writes the same metrics
+                if free:
+                    evaluate_run(folder.run, spec.split, capture)
+                    return
+            if time.monotonic() >= deadline:
+                raise CheckpointError(f"Job {folder.path.name} is being trained. Evaluate it when it has ended.")
+            time.sleep(0.2)
 
 
 def _make_video(folder: JobFolder, task: TaskFolder, spec: VideoSpec) -> None:

@@ -82,7 +82,7 @@ def test_a_wrong_parameter_is_named(tmp_path: Path) -> None:
         graings.open_scene(tmp_path / "nothing")
     with pytest.raises(ValueError, match="six numbers"):
         graings.export_model(tmp_path, tmp_path / "a.ply", box=(0, 1, 2))
-    with pytest.raises(ValueError, match=r"frames is not used by a \.ply file"):
+    with pytest.raises(ValueError, match=r"a number of frames is not used by a \.ply file"):
         graings.export_model(tmp_path, tmp_path / "a.ply", frames=3)
     with pytest.raises(graings.GraingsError, match="there is no folder"):
         graings.export_model(tmp_path, tmp_path / "none" / "a.ply")

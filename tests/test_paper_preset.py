@@ -62,6 +62,7 @@ PRINTED: Final[tuple[tuple[str, str, str, Any], ...]] = (
     ("no averaging of parameters", OBJECTIVE, "average_from", 30_000),
     ("no reduced images", OBJECTIVE, "low_resolution_until", 0),
     ("no intervention in the optimisation", OBJECTIVE, "guard.skip_only", True),
+    ("no part left out for a scene", OBJECTIVE, "plan.mode", "off"),
 )
 
 # What is printed, its section, the constant of the code, and its value.

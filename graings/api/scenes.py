@@ -88,7 +88,8 @@ def export_model(
 
     With all times: .graings, .html, .scene.gz. At the time `t` (default 0): .ply, .compressed.ply, .spz, .sog, .splat,
     .glb. At `frames` times (default 30): .zip, .4dgs. `degree`, `box`, `sphere` and `seen`: as for `graings export`.
-    Raises `ValueError`, also for what the format does not use, and `CheckpointError` for the model and the file.
+    Raises `ValueError`, also for what the format does not use, `CheckpointError` for the model and
+    `OutputError` for the file.
     """
     selection = Selection(None if box is None else tuple(box), None if sphere is None else tuple(sphere), seen)
     request = export_request(Path(path), time=t, frames=frames, degree=degree, selection=selection)

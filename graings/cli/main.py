@@ -31,7 +31,15 @@ from graings.cli.synthesize import synthesize
 from graings.cli.terminal import metrics_line, motion_line, print_line
 from graings.cli.training import MultiValueCommand, Threads, ablate, train
 from graings.cli.video import video
-from graings.errors import CaptureError, CheckpointError, ConfigError, DivergedError, GraingsError, KernelError
+from graings.errors import (
+    CaptureError,
+    CheckpointError,
+    ConfigError,
+    DivergedError,
+    GraingsError,
+    KernelError,
+    OutputError,
+)
 from graings.kernel import use_threads
 from graings.report.evaluate_run import evaluate_run
 from graings.report.folder import report_runs
@@ -46,6 +54,7 @@ EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (
     (CheckpointError, 65),
     (KernelError, UNAVAILABLE),
     (DivergedError, 70),
+    (OutputError, 74),
     (OSError, 74),
 )
 OTHER_PATH: Final = "Choose another path."
@@ -55,7 +64,8 @@ REMEDIES: Final[dict[int | None, str]] = {
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "Choose another path, or get permission for this one."),
 }
 EPILOG: Final = (
-    "Exit codes: 0 done; 1 a bug; 2 wrong usage or option; 65 the capture or checkpoint cannot be used; 69 the kernel "
+    "Exit codes: 0 done; 1 a bug, or a reported failure of doctor, demo, serve or worker; 2 wrong usage or option; 65 "
+    "the capture or checkpoint cannot be used; 69 the kernel "
     "or a package is missing; 70 training diverged; 74 a file cannot be read or written; 130 interrupted (143 by "
     "SIGTERM); an interrupted training leaves a checkpoint to resume from."
 )
@@ -177,7 +187,9 @@ def _package_command(entry: EntryPoint) -> Any:
     try:
         command = entry.load()
         if isinstance(command, typer.Typer):
-            return typer.main.get_command(command)
+            built = typer.main.get_command(command)
+            built.name = entry.name
+            return built
         group.command(entry.name)(command)
     except ImportError as error:
         reason = str(error)

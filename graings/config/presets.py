@@ -94,5 +94,6 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
             "unseen_pixels": 0.0,
         },
         "guard": {"skip_only": True},
+        "plan": {"mode": "off"},  # the residual is part of the method, whether a scene needs it or not
     },
 }

@@ -103,9 +103,9 @@ def check_used(format: str, *, time: float | None = None, frames: int | None = N
     """Raises `ValueError` for the first value that is given, so not None, and that `format` does not use."""
     single = format in WRITERS
     for name, value, used in (
-        ("time", time, single),
-        ("frames", frames, format in SEVERAL),
-        ("degree", degree, single or format in SEVERAL),
+        ("a time", time, single),
+        ("a number of frames", frames, format in SEVERAL),
+        ("a degree", degree, single or format in SEVERAL),
     ):
         if value is not None and not used:
             content = "one time" if single else "several times" if format in SEVERAL else "the whole scene"

@@ -22,7 +22,7 @@ from graings.document import read_document
 from graings.errors import CaptureError
 from graings.footage.frame_document import FootageFrames, FrameRequest
 from graings.footage.photos import convert_photographs, photographs
-from graings.footage.placement import check_free, is_finished, place
+from graings.footage.placement import check_free, is_finished, place, take_back
 from graings.footage.poses import reconstruct
 from graings.footage.registration import MIN_TRACK, check_usable, measure, nothing_registered, upright
 from graings.footage.report import REPORT_FILE, FootageReport
@@ -43,6 +43,9 @@ IMAGES: Final = "images"
 
 # In the order in which they are put into the capture's folder: with the last one the capture is complete.
 CAPTURE_FILES: Final = (IMAGES, POINTS, REPORT_FILE, TRANSFORMS)
+
+# Where they are made, without and with `static`: a finished capture has times or has none.
+MADE: Final = ("moving", "static")
 
 Observe = Callable[[str, int, int], None]
 
@@ -70,7 +73,7 @@ def make_capture(
     if source.is_dir() and not photographs(source):
         source = find_footage(source) or source  # as the service does: the folder of a folder, or of a lone video
     workspace = target / WORKSPACE
-    made = workspace / ("static" if static else "moving")  # two, as a finished one has times or has none
+    made = workspace / MADE[static]
     _check_target(source, target, made)
     seconds: dict[str, float] = {}
     observe = _timed(observe, seconds)
@@ -172,6 +175,8 @@ def _frames(source: Path, workspace: Path, request: FrameRequest, observe: Obser
             raise CaptureError(problem, file=workspace, remedy=remedy)
         if known.request == request:
             return known
+    for made in MADE:
+        take_back(workspace / made, workspace.parent, CAPTURE_FILES)
     # Features and matches of other frames would be taken for those of the new ones.
     for content in workspace.iterdir():
         if content.name != LOCK_FILE:

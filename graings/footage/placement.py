@@ -28,6 +28,14 @@ def check_free(made: Path, target: Path, names: Sequence[str]) -> None:
             raise CaptureError(f"holds {name} already, which the capture would replace", file=target, remedy=remedy)
 
 
+def take_back(made: Path, target: Path, names: Sequence[str]) -> None:
+    """Undo the moves of an interrupted `place`, if `made` is finished; what was not moved stays."""
+    if is_finished(made, names):
+        for name in names:
+            if not (made / name).exists() and (target / name).exists():
+                (target / name).rename(made / name)
+
+
 def place(made: Path, target: Path, names: Sequence[str]) -> None:
     """Move the files and folders `names` from `made` to `target`, in this order. Raises as `check_free`."""
     check_free(made, target, names)

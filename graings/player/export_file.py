@@ -35,7 +35,7 @@ def export_request(
     """The request of splats in a file named `path`; None for a format with the whole scene.
 
     None stands for time 0, `FRAMES` frames and the degree that is needed. Raises `ValueError` for a suffix that is not
-    written, values out of range or that the format does not use, and a selection from a whole scene; `CheckpointError`
+    written, values out of range or that the format does not use, and a selection from a whole scene; `OutputError`
     where no file can be written at `path`.
     """
     format, selection = export_format(path), selection or Selection()
@@ -51,7 +51,7 @@ def export_request(
 def export_file(model: Model, path: Path, request: ExportRequest | None) -> str:
     """Write `path` as `export_request` understood it; returns a line on its size and content.
 
-    Raises `ValueError` where no splats are left or the format cannot hold them, and `CheckpointError`.
+    Raises `ValueError` where no splats are left or the format cannot hold them, and `OutputError`.
     """
     if request is not None:
         exported = export_splats(model, request)

@@ -190,6 +190,11 @@ def intact(checkpoint: Path) -> Iterator[None]:
     """Raise `CheckpointError` about `checkpoint` where its contents do not fit."""
     try:
         yield
+    except KeyError as error:
+        raise CheckpointError(
+            f"{checkpoint}: its training state lacks {error}: another version wrote it, or it is damaged. Continue "
+            "with the version that wrote it, or train again; the model in it can be rendered."
+        ) from error
     except DAMAGE as error:
         raise CheckpointError(
             f"{checkpoint}: damaged training state ({error!r}). Remove it to continue from an earlier one."

@@ -22,7 +22,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from graings import constants
-from graings.errors import CheckpointError
+from graings.errors import CheckpointError, OutputError
 from graings.scene.scaffold import Scaffold, per_slot
 from graings.scene.scene import Scene
 from graings.storage.checkpoint import load_model
@@ -46,7 +46,7 @@ _HALVED: Final = ("features", "opacity_offsets")
 def write_compact(model: Model, path: Path) -> int:
     """Write `model` to the file `path`, whole or not at all; returns its size in bytes.
 
-    Raises `CheckpointError` where the file cannot be written.
+    Raises `OutputError` where the file cannot be written.
     """
     check_writable(path)
     tensors = {name: tensor.detach() for name, tensor in model.scene.state_dict().items()}
@@ -78,7 +78,7 @@ def write_compact(model: Model, path: Path) -> int:
     try:
         write_bytes(path, packed)
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot write the model ({error.strerror}). Name another place.") from error
+        raise OutputError(f"{path}: cannot write the model ({error.strerror}). Name another place.") from error
     return len(packed)
 
 

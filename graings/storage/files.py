@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from graings.document import Document
-from graings.errors import CheckpointError
+from graings.errors import OutputError
 
 
 def check_writable(path: Path) -> None:
-    """Raises `CheckpointError` where `path` is a folder, or is in none that can be written to."""
+    """Raises `OutputError` where `path` is a folder, or is in none that can be written to."""
     if path.is_dir():
-        raise CheckpointError(f"{path}: is a folder where a file is wanted. Name a file in it.")
+        raise OutputError(f"{path}: is a folder where a file is wanted. Name a file in it.")
     if not path.parent.is_dir():
-        raise CheckpointError(f"{path}: there is no folder {path.parent}. Make it, or name another place.")
+        raise OutputError(f"{path}: there is no folder {path.parent}. Make it, or name another place.")
     try:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be written ({error.strerror}). Name another place.") from error
+        raise OutputError(f"{path}: cannot be written ({error.strerror}). Name another place.") from error
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -44,8 +44,8 @@ def export(job_id: JobId, here: ContextDep, query: Annotated[ExportQuery, Query(
     """The newest model of a job as splats. One export is made at a time."""
     try:
         selection = Selection(_numbers(query.box), _numbers(query.sphere), query.seen)
-        check_used(query.format, time=query.t, frames=query.frames, degree=query.degree)
         request = ExportRequest(query.format, query.t or 0.0, query.frames or FRAMES, query.degree, selection)
+        check_used(query.format, time=query.t, frames=query.frames, degree=query.degree)
     except ValueError as error:
         raise BadRequest(f"{error}.") from error
     loaded = here.models.load(here.store.folder(job_id).run)

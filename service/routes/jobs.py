@@ -1,4 +1,4 @@
-"""Routes of jobs: submit, list, get, cancel, resume, retry, delete. `jobs.queue` implements them."""
+"""Routes of jobs: submit, list, get, cancel, resume, retry, extend, delete. `jobs.queue` implements them."""
 
 from __future__ import annotations
 

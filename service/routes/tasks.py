@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 from graings.errors import CheckpointError
 from graings.export.camera_path import frames_of
 from graings.export.shown import Shown
-from graings.export.video import check_video
+from graings.export.video import check_video, video_size
 from jobs.job import JobConflict, JobState
 from jobs.task import MAX_FRAMES, EvaluationSpec, HeldOut, Task, TaskProgress, TaskSpec, VideoSpec
 from service.context import ContextDep, JobId
@@ -75,11 +75,12 @@ def make_video(job_id: JobId, spec: VideoSpec, context: ContextDep, response: Re
     shown = Shown(loaded.scene, model.units, model.views, model.background, model.digest)
     try:  # now, while the client waits: nothing but the rendering is left to the worker
         check_video(Path(f"video.{spec.format}"), spec.fps)
-        count = len(frames_of(shown, spec.request, spec.path, spec.moves, spec.frames))
+        frames = frames_of(shown, spec.request, spec.path, spec.moves, spec.frames)
+        video_size(Path(f"video.{spec.format}"), frames[0][0])
     except (ValueError, CheckpointError) as error:
         raise BadRequest(f"{error}".rstrip(".") + ".") from error
-    if count > MAX_FRAMES:  # a path of nerfstudio's brings its own
-        raise BadRequest(f"path: has {count} frames; at most {MAX_FRAMES} are made.")
+    if len(frames) > MAX_FRAMES:  # a path of nerfstudio's brings its own
+        raise BadRequest(f"path: has {len(frames)} frames; at most {MAX_FRAMES} are made.")
     return _accepted(context.tasks.submit(job_id, spec), response)
 
 

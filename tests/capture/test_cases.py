@@ -116,7 +116,7 @@ def test_missing_pictures_of_a_colmap_model_are_skipped_too(tmp_path: Path) -> N
     assert "1 of 20 images of sparse/0 (5%) are missing" in note(folder, "missing")
 
 
-@pytest.mark.parametrize("listed", [(3,), (3, 5), (0, 3, 5, 7)])
+@pytest.mark.parametrize("listed", [(3, 5), (0, 3, 5, 7)])
 def test_a_missing_picture_may_be_in_the_test_list_of_a_colmap_model(tmp_path: Path, listed: tuple[int, ...]) -> None:
     folder = write_colmap(tmp_path, count=10)
     (folder / "sparse/0/test.txt").write_text("".join(f"frame_{10 * index:04d}.png\n" for index in listed))
@@ -125,6 +125,16 @@ def test_a_missing_picture_may_be_in_the_test_list_of_a_colmap_model(tmp_path: P
     assert {frame.name for frame in capture.test} == {f"images/frame_{10 * i:04d}.png" for i in listed if i != 3}
     assert sum(count(folder)) == 9
     assert "1 of 10 images" in note(folder, "are missing and left out")
+
+
+def test_a_test_list_of_a_colmap_model_without_one_picture_is_left_out_and_images_are_held_out_instead(
+    tmp_path: Path,
+) -> None:
+    folder = write_colmap(tmp_path, count=10)
+    (folder / "sparse/0/test.txt").write_text("frame_0030.png\n")
+    (folder / "images/frame_0030.png").unlink()
+    assert "none of its images is there" in note(folder, "sparse/0/test.txt is left out")
+    assert count(folder) == (6, 1, 2)
 
 
 def test_a_split_that_was_never_rendered_is_left_out_and_images_are_held_out_instead(tmp_path: Path) -> None:

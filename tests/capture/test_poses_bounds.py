@@ -70,6 +70,14 @@ def test_poses_belong_to_the_folders_of_a_rig(tmp_path: Path, place: str) -> Non
         check_camera(frame.camera, camera, capture.units.camera_back(frame.camera))
 
 
+@pytest.mark.parametrize("rig", [False, True])
+def test_one_pose_belongs_to_all_pictures_of_a_still_camera(tmp_path: Path, rig: bool) -> None:
+    for time in range(12):
+        write_image(tmp_path / f"images/{time:04d}.png", pixels(SIZE[1], SIZE[0], 3, seed=time))
+    capture = load_capture(write_poses(tmp_path, count=1), CaptureConfig(rig=rig))
+    assert sum(len(capture.split(split)) for split in ("train", "val", "test")) == 12
+
+
 def test_with_the_option_the_folders_of_a_rig_are_read_beside_the_calibrated_pictures(tmp_path: Path) -> None:
     write_llff(tmp_path)
     write_rig(tmp_path)

@@ -67,6 +67,24 @@ def test_a_rig_of_a_transforms_file_is_read_too(tmp_path: Path) -> None:
     assert opengl(poses[0]) != opengl(poses[1])
 
 
+@pytest.mark.parametrize("files", ["one", "a split each"])
+def test_frames_that_are_all_listed_are_not_read_as_a_rig(tmp_path: Path, files: str) -> None:
+    """Each listed image has its own pose; the folder of one is that of the others."""
+    names = [f"./images/cam/{index:03d}" for index in range(6)]
+    entries = [entry(orbit(index, 6), name, index / 5) for index, name in enumerate(names)]
+    for index, name in enumerate(names):
+        write_image(tmp_path / f"{name}.png", pixels(20, 32, 3, seed=index))
+    write_transforms(tmp_path, "train", entries[:4])
+    if files == "a split each":
+        write_transforms(tmp_path, "test", entries[4:])
+    assert sum(len(load_capture(tmp_path).split(split)) for split in ("train", "val", "test")) == (
+        4 if files == "one" else 6
+    )
+    with pytest.raises(CaptureError, match="lie in one folder: not a camera each") as caught:
+        load_capture(tmp_path, RIG)
+    assert caught.value.remedy == "Set capture.rig=false."
+
+
 def transforms_rig(folder: Path, place: str = "frame_{:05d}", **top: object) -> Path:
     """A transforms file of one instant and two frames for each of its nine cameras."""
     write_single(folder, 9, **top)

@@ -60,7 +60,7 @@ def test_a_place_where_no_file_can_be_is_refused_before_the_model_is_read(
         output.mkdir(parents=True)
     with pytest.raises(SystemExit) as ended:
         main([command, str(tmp_path / "absent"), "-o", str(output)])
-    assert ended.value.code == 65
+    assert ended.value.code == 74
     message = capsys.readouterr().err
     assert message.startswith(f"{output}: ")
     assert ("is a folder" if place == "a folder" else f"there is no folder {output.parent}") in message
@@ -71,7 +71,7 @@ def test_a_place_where_no_file_can_be_is_refused_before_the_model_is_read(
 def test_a_read_only_folder_is_refused_before_the_model_is_read(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["export", "absent", "-o", "/sys/a.ply"])
-    assert ended.value.code == 65
+    assert ended.value.code == 74
     assert "/sys/a.ply: cannot be written (" in capsys.readouterr().err
 
 

@@ -72,6 +72,7 @@ def interrupted_while_placing(source: Path, target: Path, monkeypatch: pytest.Mo
         context.setattr(module, "place", place)
         with pytest.raises(KeyboardInterrupt):
             make_capture(source, target)
+    assert {path.name for path in target.iterdir()} == {WORKSPACE, *CAPTURE_FILES[:moved]}
 
 
 def images_of_the_target(root: Path) -> tuple[Path, Path]:
@@ -209,11 +210,21 @@ def test_a_call_that_was_interrupted_between_two_files_is_finished(
 ) -> None:
     source, target = photos(tmp_path / "photos"), tmp_path / "c"
     interrupted_while_placing(source, target, monkeypatch, moved)
-    made = {path.name for path in target.iterdir()} - {WORKSPACE}
-    assert made == set(CAPTURE_FILES[:moved])
     report = make_capture(source, target)
     assert report.registered == COUNT
     assert {path.name for path in target.iterdir()} == set(CAPTURE_FILES)
+    assert len(list((target / "images").iterdir())) == COUNT
+
+
+@pytest.mark.parametrize("moved", range(len(CAPTURE_FILES)))
+def test_a_call_that_was_interrupted_between_two_files_begins_again_with_other_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved: int
+) -> None:
+    source, target = photos(tmp_path / "photos"), tmp_path / "c"
+    interrupted_while_placing(source, target, monkeypatch, moved)
+    (target / "notes.txt").write_text("of the user")
+    make_capture(source, target, max_side=500)
+    assert {path.name for path in target.iterdir()} == {"notes.txt", *CAPTURE_FILES}
     assert len(list((target / "images").iterdir())) == COUNT
 
 

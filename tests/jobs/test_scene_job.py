@@ -73,7 +73,8 @@ def test_the_seconds_of_the_capture_are_booked_as_such_by_all_attempts(
         ProgressWriter(folder.progress),
     )
 
-    def draw(*_: object, observe: Callable[[int, int], None], **__: object) -> None:
+    def draw(_: str, target: Path, *, observe: Callable[[int, int], None], **__: object) -> None:
+        target.mkdir()
         for done in (1, 2):
             time.sleep(0.1)
             observe(done, 3)
@@ -94,6 +95,25 @@ def test_the_seconds_of_the_capture_are_booked_as_such_by_all_attempts(
     progress.close()
     assert phase_s["loading"] == 5.0
     assert last.phase_s["capture"] + 0.3 <= phase_s["capture"] <= last.phase_s["capture"] + time.monotonic() - before
+
+
+def test_a_scene_that_was_drawn_is_not_drawn_again(tmp_path: Path) -> None:
+    """The trainer of an extended job starts again, and the ended one is still evaluated on its capture."""
+    store = Store(tmp_path)
+    folder = job(store, SceneRecipe(scene="still", size=32, views=3))
+    upload, stop, progress = store.capture("0" * 64), Event(), ProgressWriter(folder.progress)
+    stop.set()
+    with pytest.raises(Stopped):
+        capture_of(upload, folder, 1, 12, {}, progress, stop)
+    assert not folder.capture.exists()
+    stop.clear()
+    assert capture_of(upload, folder, 1, 12, {}, progress, stop) == (folder.capture, ["drew the synthetic scene still"])
+    stop.set()  # so that a second drawing would end
+    before = {file: file.stat().st_mtime_ns for file in folder.capture.rglob("*")}
+    assert capture_of(upload, folder, 1, 12, {}, progress, stop) == (folder.capture, [])
+    assert {file: file.stat().st_mtime_ns for file in folder.capture.rglob("*")} == before
+    assert store.trained_on(folder.path.name) == folder.capture
+    progress.close()
 
 
 def test_a_recipe_is_the_only_file_of_its_folder(tmp_path: Path) -> None:

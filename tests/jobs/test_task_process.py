@@ -30,6 +30,31 @@ def test_an_evaluation_does_not_wait_for_a_training(tmp_path: Path, monkeypatch:
     assert evaluated == []
 
 
+def test_an_evaluation_waits_for_another_however_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = job(Store(tmp_path), monkeypatch, [])
+    monkeypatch.setattr(task_process, "LOCK_WAIT_S", 0.3)
+    running, ended = threading.Event(), threading.Event()
+    evaluated: list[str] = []
+
+    def evaluate(run: Path, split: str, capture: Path) -> None:
+        running.set()
+        assert ended.wait(60) or split == "test"
+        evaluated.append(split)
+
+    monkeypatch.setattr(task_process, "evaluate_run", evaluate)
+    threads = [threading.Thread(target=task_process._evaluate, args=(folder, EvaluationSpec(split="val")))]
+    threads[0].start()
+    assert running.wait(60)
+    threads.append(threading.Thread(target=task_process._evaluate, args=(folder, EvaluationSpec(split="test"))))
+    threads[1].start()
+    threads[1].join(1.0)
+    assert evaluated == []
+    ended.set()
+    for thread in threads:
+        thread.join(60)
+    assert evaluated == ["val", "test"]
+
+
 def test_an_evaluation_waits_for_a_trainer_that_is_about_to_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -88,3 +88,17 @@ def test_a_view_shows_transparency_and_depth(
 
 def test_layers_need_exr(client: TestClient, model: str) -> None:
     assert "exr" in problem(client.get("/render", params={"show": "layers", "format": "png"}), 422)["detail"]
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ({"format": "foo", "t": 0.3}, "format 'foo' is not written"),
+        ({"format": "zip", "t": 0.3}, "a time is not used by a .zip file"),
+        ({"format": "ply", "frames": 3}, "a number of frames is not used by a .ply file"),
+    ],
+)
+def test_an_export_that_cannot_be_made_is_refused_for_its_own_reason(
+    client: TestClient, model: str, query: dict[str, Any], message: str
+) -> None:
+    assert message in problem(client.get(f"/jobs/{model}/export", params=query), 422)["detail"]

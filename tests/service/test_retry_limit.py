@@ -95,6 +95,17 @@ def test_events_end_with_an_error_after_a_minute_of_failures(
 
 
 @pytest.mark.parametrize("asynchronously", [False, True])
+@pytest.mark.parametrize("content", ["text/html", "text/event-stream"])
+def test_streams_without_an_event_are_failures_too(clock: Clock, content: str, asynchronously: bool) -> None:
+    def answer(request: httpx2.Request) -> httpx2.Response:
+        return httpx2.Response(200, headers={"Content-Type": content}, text="<html>")
+
+    with pytest.raises(ClientError, match="at once" if content == "text/event-stream" else "does not answer"):
+        kinds(answer, asynchronously)
+    assert 60 < clock.now - 1_000 < 70
+
+
+@pytest.mark.parametrize("asynchronously", [False, True])
 def test_events_of_a_job_that_is_not_there_are_an_error_at_once(clock: Clock, asynchronously: bool) -> None:
     with pytest.raises(RefusedError, match="404"):
         kinds(lambda request: httpx2.Response(404, json={}), asynchronously)

@@ -137,6 +137,8 @@ def test_a_video_goes_on_after_the_death_of_its_worker_and_a_deleted_one_stops(
         ({"path": "spiral"}, "path"),
         ({"background": "mauve"}, "background"),
         ({"width": 0}, "width"),
+        ({"width": 1, "format": "mp4"}, "2 x 2"),
+        ({"path": nerfstudio(render_width=1), "format": "mp4"}, "2 x 2"),
         ({"fps": -1}, "fps"),
         ({"fps": 120, "format": "gif"}, "fps"),
         ({"path": {"keys": [{"camera": 3, "t": 0}]}}, "keys[0]"),

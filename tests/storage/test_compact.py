@@ -13,7 +13,7 @@ import torch
 from graings import constants
 from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
-from graings.errors import CheckpointError
+from graings.errors import CheckpointError, OutputError
 from graings.render import render
 from graings.report.evaluate_run import evaluate_run
 from graings.storage.checkpoint import load_model
@@ -115,7 +115,7 @@ def test_a_model_of_which_nothing_shows_is_an_empty_picture(run: Path, tmp_path:
 
 def test_a_folder_where_a_file_is_wanted_is_named(run: Path, tmp_path: Path) -> None:
     for folder in (tmp_path, Path(".")):
-        with pytest.raises(CheckpointError, match="is a folder where a file is wanted"):
+        with pytest.raises(OutputError, match="is a folder where a file is wanted"):
             write_compact(load_model(run), folder)
 
 
@@ -139,5 +139,5 @@ def test_a_cut_off_file_is_named_and_a_full_disk_leaves_the_old_one(run: Path, t
     file.write_bytes(whole[:-100])
     with pytest.raises(CheckpointError, match="damaged"):
         open_model(file)
-    with pytest.raises(CheckpointError, match="there is no folder"):
+    with pytest.raises(OutputError, match="there is no folder"):
         write_compact(model, tmp_path / "absent" / "scene.graings")

@@ -176,6 +176,9 @@ def _splits(
         raise CaptureError(
             f"{unknown[0]!r} is no image of the model", file=list_file, remedy="Correct or remove the name."
         )
-    notes.append(f"test images are those of {list_file}")
     test = {frame for name in listed for frame in rig.named(name)}
+    if listed - {""} and not test:
+        notes.append(f"{list_file} is left out: none of its images is there")
+        return split_held_out(rig.frames, every, notes, source=model_folder)
+    notes.append(f"the {len(test)} test images are those of {list_file}")
     return split_held_out(rig.frames, every, notes, source=list_file, test=test)

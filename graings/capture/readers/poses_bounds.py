@@ -64,7 +64,8 @@ def _sources(folder: CaptureFolder, count: int, rig: bool) -> tuple[list[list[st
     for place in (".", "images"):
         root = folder.root / place
         inner = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-        inner = [name for name in inner if name not in IMAGE_FOLDERS]  # the calibrated pictures, not a camera's frames
+        if count > 1:  # the calibrated pictures of several cameras are not the frames of one
+            inner = [name for name in inner if name not in IMAGE_FOLDERS]
         frames = [files for files in (_frames(folder, str(Path(place, name))) for name in inner) if len(files) > 1]
         if len(frames) == count:
             return frames, True

@@ -36,7 +36,7 @@ def with_rig(
     """With `config.rig` every frame of the folder of each calibrated image, else `frames` and how to get them.
 
     The number in a frame's name is its time; the mask of a calibrated image is that of its camera. Raises
-    `CaptureError` where a camera has no folder.
+    `CaptureError` where a camera has no folder, or two have the same.
     """
     folders = {name: frame_folder(folder, name) for name in frames}
     found = {name: place for name, place in folders.items() if place is not None}
@@ -50,6 +50,7 @@ def with_rig(
         return RigFrames(dict(frames), {name: (name,) for name in frames})
     of_image: dict[str, tuple[str, ...]] = {}
     timed: dict[str, RawFrame] = {}
+    cameras: dict[str, str] = {}  # the listed image of each folder
     for name, frame in frames.items():
         if name not in found:
             stem = PurePosixPath(name).with_suffix("")
@@ -57,9 +58,17 @@ def with_rig(
                 f"the camera {name} has no folder of frames (looked for {stem} and {stem.name})",
                 file=name,
                 field="capture.rig",
-                remedy="Put the frames of each camera into a folder of its name.",
+                remedy="Put the frames of each camera into a folder of its name, or set capture.rig=false.",
             )
         place = found[name]
+        if place in cameras:
+            raise CaptureError(
+                f"{cameras[place]} and {name} are listed, whose frames lie in one folder: not a camera each",
+                file=name,
+                field="capture.rig",
+                remedy="Set capture.rig=false.",
+            )
+        cameras[place] = name
         images = [_like(folder.image(picture, source=place), frame) for picture in pictures(folder, place)]
         timed |= {image.name: replace(frame, image=image, time=time_from_name(image.name)) for image in images}
         of_image[name] = tuple(image.name for image in images)
