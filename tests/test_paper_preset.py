@@ -71,7 +71,7 @@ CONSTANTS: Final[tuple[tuple[str, str, float, float], ...]] = (
     ("Eq. 10: bound of the clip of Delta rho", DEFORMATION, MAX_LOG_SCALE_OFFSET, 2.0),
 )
 
-# Not printed: our readings, with their reasons in docs/method.md. Fixed here so that none changes unnoticed.
+# Not printed: our choices, with their reasons in docs/method.md. Fixed here so that none changes unnoticed.
 READINGS: Final[dict[str, Any]] = {
     "batch": 1,
     "matrix_optimizer": "adam",
