@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import typer
 
 from graings.capture.synthetic import write_synthetic
-from graings.cli.main import main
+from graings.cli.main import Commands, app, main
 from graings.config import TrainConfig, make_config
 from graings.evaluation.metrics import psnr
 from graings.storage.checkpoint import load_model, newest_checkpoint
@@ -332,6 +333,9 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert graings("--help") == 0
     text = capsys.readouterr().out
     rows = re.findall(r"│ ([a-z]+)  +\S", text)
+    command = typer.main.get_command(app)
+    assert isinstance(command, Commands)
+    assert rows == command.list_commands(typer.Context(command))
     assert {"train", "demo", "keys", "serve", "worker"} <= set(rows)
 
 

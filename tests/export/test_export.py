@@ -240,11 +240,12 @@ def test_a_wrong_request_is_refused(wrong: Any, message: str) -> None:
 @pytest.mark.parametrize("format", [*FORMATS, *WHOLE])
 def test_what_a_format_does_not_use_is_refused_with_both_names(format: str) -> None:
     used = {"frames", "degree"} if format in SEVERAL else set() if format in WHOLE else {"time", "degree"}
+    words = {"time": "a time", "frames": "a number of frames", "degree": "a degree"}
     for name, value in (("time", 0.0), ("frames", 30), ("degree", 0)):
         if name in used:
             check_used(format, **{name: value})  # type: ignore[arg-type]
         else:
-            with pytest.raises(ValueError, match=rf"{name}.* is not used by a \.{format} file"):
+            with pytest.raises(ValueError, match=rf"^{words[name]} is not used by a \.{format} file"):
                 check_used(format, **{name: value})  # type: ignore[arg-type]
     check_used(format)
 

@@ -204,26 +204,16 @@ def test_files_that_came_while_the_capture_was_made_are_not_replaced(tmp_path: P
     assert {path.name for path in target.iterdir()} == set(CAPTURE_FILES)
 
 
+@pytest.mark.parametrize("max_side", [1000, 500])  # of the call that was interrupted, and another one: it begins again
 @pytest.mark.parametrize("moved", range(len(CAPTURE_FILES)))
 def test_a_call_that_was_interrupted_between_two_files_is_finished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved: int
-) -> None:
-    source, target = photos(tmp_path / "photos"), tmp_path / "c"
-    interrupted_while_placing(source, target, monkeypatch, moved)
-    report = make_capture(source, target)
-    assert report.registered == COUNT
-    assert {path.name for path in target.iterdir()} == set(CAPTURE_FILES)
-    assert len(list((target / "images").iterdir())) == COUNT
-
-
-@pytest.mark.parametrize("moved", range(len(CAPTURE_FILES)))
-def test_a_call_that_was_interrupted_between_two_files_begins_again_with_other_images(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved: int, max_side: int
 ) -> None:
     source, target = photos(tmp_path / "photos"), tmp_path / "c"
     interrupted_while_placing(source, target, monkeypatch, moved)
     (target / "notes.txt").write_text("of the user")
-    make_capture(source, target, max_side=500)
+    report = make_capture(source, target, max_side=max_side)
+    assert report.registered == COUNT
     assert {path.name for path in target.iterdir()} == {"notes.txt", *CAPTURE_FILES}
     assert len(list((target / "images").iterdir())) == COUNT
 
