@@ -42,6 +42,29 @@ def test_a_ladder_that_misses_an_option_is_refused(scripts: Any, monkeypatch: py
         ladder.check_ladder(20_000)
 
 
+def test_every_addition_of_the_ladder_is_undone_alone(scripts: Any) -> None:
+    """From the losses to averaging; the budget, the time window and the plan show nothing in scenes that need none."""
+    ladder, single = scripts("ladder"), scripts("leave_one_out")
+    rows = [row for row in ladder.ROWS if row.name in {"losses", "appearance", "rasterizer", "optimizer", "end"}]
+    undone = [name for addition in single.ADDITIONS for name in addition.options]
+    assert sorted(undone) == sorted(name for row in rows for name in row.options)
+    full = single.config_of(single.ADDITIONS[0], "standard", 3, 1)
+    for addition in single.ADDITIONS[1:]:
+        config = single.config_of(addition, "standard", 3, 1)
+        assert config.seed == 3
+        for name in undone:
+            source = single.PAPER if name in addition.options else full
+            assert single.option(config, name) == single.option(source, name), (addition.name, name)
+
+
+def test_an_addition_that_the_preset_lacks_has_no_row(scripts: Any, tmp_path: Path) -> None:
+    single = scripts("leave_one_out")
+    for preset, has in (("draft", False), ("standard", True)):
+        lines = list(single.table(tmp_path, [tmp_path / "scene"], preset, [0]))
+        assert any("residual_view" in line for line in lines) == has
+        assert any("reflection" in line for line in lines)
+
+
 @pytest.mark.slow(reason="a training with its report")
 def test_a_run_is_finished_once_and_refused_with_other_options(scripts: Any, micro: Path, tmp_path: Path) -> None:
     runs = scripts("runs")
