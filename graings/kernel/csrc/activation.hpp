@@ -1,7 +1,7 @@
 // Sigmoid and tanh, and colours from the outputs of their networks. Computed in float64 and rounded once: the values do
 // not depend on their position in an array.
 #pragma once
-#include "simd.hpp"
+#include "exponentials.hpp"
 #include "types.hpp"
 
 namespace graings::GRAINGS_ISA {

@@ -1,8 +1,9 @@
 // Projection of Gaussians to records and its adjoint: always in float64, eight Gaussians at a time.
 // The footprint is stored as a shear; its determinant is computed without a subtraction.
 #pragma once
-#include "columns.hpp"
+#include "exponentials.hpp"
 #include "ranks.hpp"
+#include "records.hpp"
 #include "types.hpp"
 
 namespace graings::GRAINGS_ISA {
