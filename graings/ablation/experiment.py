@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from graings.ablation.plot import differences_figure
-from graings.ablation.rows import ROWS, Row, chosen_rows, combined, nothing_to_compare, row_config
+from graings.ablation.rows import ROWS, Row, chosen_rows, combined, dotted, nothing_to_compare, row_config
 from graings.ablation.table import TABLE_FILE, AblationCapture, AblationTable, make_table, markdown
 from graings.capture.capture import Capture
 from graings.capture.load import load_capture
@@ -199,20 +199,13 @@ def _comparable(options: Mapping[str, Any]) -> dict[str, Any]:
 
 def _changed_from_preset(options: Mapping[str, Any], preset: str) -> dict[str, Any]:
     """The options, by dotted name, that are not those of the preset."""
-    defaults = _dotted(make_config(preset).model_dump(mode="json"))
-    return {key: value for key, value in _dotted(options).items() if defaults[key] != value}
-
-
-def _dotted(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in options.items():
-        flat |= _dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
+    defaults = dotted(make_config(preset).model_dump(mode="json"))
+    return {key: value for key, value in dotted(options).items() if defaults[key] != value}
 
 
 def _check_same(folder: Path, begun: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
     """Raise `ConfigError` naming the options that differ."""
-    before, now = _dotted(begun), _dotted(wanted)
+    before, now = dotted(begun), dotted(wanted)
     different = [key for key in {**before, **now} if before.get(key) != now.get(key)]
     if different:
         changes = ", ".join(f"{key} was {before.get(key)!r} and is now {now.get(key)!r}" for key in different)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from graings.config import ConfigSection, TrainConfig, make_config
+from graings.config import TrainConfig, make_config, merged
 from graings.errors import ConfigError
 
 # The switches as the method sets them.
@@ -137,14 +137,14 @@ def row_config(row: Row, preset: str, settings: Mapping[str, Any], seed: int) ->
     same = nothing_to_compare(row, preset, settings)
     if same is not None:
         raise ConfigError(f"{same} Raise it, or leave the row out (--rows).")
-    config = make_config(preset, dict(settings))
-    if "seed" in config.model_fields_set:
+    given = dotted(merged(settings))
+    if "seed" in given:
         raise ConfigError("seed: an ablation gives every row the same seeds. Leave it out and use --seeds.")
-    for key, wanted in row.options.items():
-        value, by_user = _option(config, key)
-        if by_user and value != wanted:
+    # Loss weights are not compared: the user's is that of the other rows.
+    for key in METHOD:
+        if key in given and given[key] != row.options[key]:
             raise ConfigError(
-                f"{key}: is set to {value!r}, but the row {row.name} is {wanted!r} there. "
+                f"{key}: is set to {given[key]!r}, but the row {row.name} is {row.options[key]!r} there. "
                 "Leave the setting out, or name the rows that agree with it (--rows)."
             )
     return combined(row, preset, settings, seed)
@@ -154,20 +154,26 @@ def nothing_to_compare(row: Row, preset: str, settings: Mapping[str, Any]) -> st
     """Why the row would equal the full model under these options; None where it differs."""
     config = make_config(preset, dict(settings))
     for key, number in row.needs.items():
-        if _option(config, key)[0] <= number:
+        if _option(config, key) <= number:
             return f"{key}: is {number}, so the row {row.name} would equal the full model."
     return None
 
 
 def combined(row: Row, preset: str, settings: Mapping[str, Any], seed: int) -> TrainConfig:
     """As `row_config`, without the checks."""
-    return make_config(preset, {**settings, **row.options, "seed": seed})
+    return make_config(preset, merged(settings, row.options, {"seed": seed}))
 
 
-def _option(config: TrainConfig, key: str) -> tuple[Any, bool]:
-    """Value of a dotted option, and whether it was given rather than left at its default."""
-    *parts, name = key.split(".")
-    owner: ConfigSection = config
-    for part in parts:
-        owner = getattr(owner, part)
-    return getattr(owner, name), name in owner.model_fields_set
+def dotted(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested options by dotted name."""
+    flat: dict[str, Any] = {}
+    for key, value in options.items():
+        flat |= dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _option(config: TrainConfig, key: str) -> Any:
+    value: Any = config
+    for part in key.split("."):
+        value = getattr(value, part)
+    return value

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from graings.ablation.rows import METHOD, ROWS, chosen_rows, row_config
-from graings.config import ConfigSection, make_config
+from graings.ablation.rows import METHOD, ROWS, chosen_rows, nothing_to_compare, row_config
+from graings.config import PRESETS, ConfigSection, make_config
 from graings.errors import ConfigError
 from tests.models import EYE, tiny_scene
 
@@ -72,6 +72,21 @@ def test_a_setting_that_contradicts_a_row_is_refused_and_one_that_agrees_is_not(
     with pytest.raises(ConfigError, match=r"scene\.residual.*no_residual.*--rows"):
         row_config(row, "draft", form, 0)
     row_config(ROWS[0], "draft", form, 0)
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+def test_what_a_preset_sets_contradicts_no_row(preset: str) -> None:
+    """Every row of a preset is what its name says, or equals the full model and says so."""
+    for row in ROWS:
+        if nothing_to_compare(row, preset, {}) is None:
+            config = flat(row_config(row, preset, {}, 0))
+            assert {key: config[key] for key in row.options} == row.options
+
+
+def test_the_users_weight_of_a_loss_is_that_of_the_rows_that_have_it() -> None:
+    settings = {"loss": {"temporal": 0.02}}
+    temporal = [row_config(row, "draft", settings, 0).loss.temporal for row in chosen_rows(["full", "no_l_temp"])]
+    assert temporal == [0.02, 0.0]
 
 
 @pytest.mark.parametrize(
