@@ -29,6 +29,11 @@ JPEG_SIGNATURE: Final = b"\xff\xd8\xff"
 EXR_SIGNATURE: Final = b"\x76\x2f\x31\x01"
 # These have no end marker that could be followed: they are decoded once.
 DECODED_ONCE: Final = (EXR_SIGNATURE, b"RIFF", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"GIF8")
+# Formats whose alpha is straight though OpenImageIO does not say so.
+ALWAYS_STRAIGHT: Final = ("bmp", "gif")
+# Where the mask of alpha is in a BMP, and the kinds of compression for which it counts.
+BMP_ALPHA_MASK: Final = slice(66, 70)
+BMP_BIT_FIELDS: Final = (3, 6)
 # The fourth to twelfth byte of containers for photographs whose decoders are not part of OpenImageIO's package.
 PHOTO_CONTAINERS: Final = {b"heic": "HEIC", b"heix": "HEIC", b"mif1": "HEIC", b"msf1": "HEIC", b"avif": "AVIF"}
 
@@ -82,11 +87,11 @@ def check_image(path: Path, name: str, data: bytes) -> ImageFile:
     spec = source.spec()
     source.close()
     code = spec.get_int_attribute("Orientation", 1)
-    has_alpha = _channels(spec, name)[1] is not None
-    image = ImageFile(path, name, spec.width, spec.height, has_alpha, code if 1 <= code <= 8 else 1)
-    if not data.startswith((PNG_SIGNATURE, JPEG_SIGNATURE)):
-        decode(path, name)
-    return image
+    if data.startswith((PNG_SIGNATURE, JPEG_SIGNATURE)):
+        has_alpha = _channels(spec, name)[1] is not None
+    else:
+        has_alpha = decode(path, name).shape[2] == 4
+    return ImageFile(path, name, spec.width, spec.height, has_alpha, code if 1 <= code <= 8 else 1)
 
 
 def decode(path: Path, name: str, orientation: int = 1) -> NDArray[np.float32]:
@@ -100,11 +105,15 @@ def decode(path: Path, name: str, orientation: int = 1) -> NDArray[np.float32]:
     color, alpha = _channels(spec, name)
     stored = source.read_image(0, 0, 0, spec.nchannels, spec.format)
     problem = library_problem(source)
-    straight = spec.get_int_attribute("oiio:UnassociatedAlpha") == 1  # PNG and WebP; EXR is premultiplied, TIFF either
+    # PNG and WebP say so, EXR is premultiplied, TIFF either; of BMP and GIF the library says nothing.
+    straight = spec.get_int_attribute("oiio:UnassociatedAlpha") == 1 or source.format_name() in ALWAYS_STRAIGHT
+    may_be_unused = source.format_name() == "bmp" and not _bmp_declares_alpha(path)
     source.close()
     if stored is None or problem:
         raise _damaged(name, f"cannot be decoded ({problem})")
     stored = np.asarray(stored).reshape(spec.height, spec.width, spec.nchannels)
+    if alpha is not None and may_be_unused and not stored[..., alpha].any():
+        alpha = None
     pixels = stored[..., color if alpha is None else [*color, alpha]].astype(np.float32)
     if np.issubdtype(stored.dtype, np.integer):
         pixels /= np.float32(np.iinfo(stored.dtype).max)
@@ -170,6 +179,15 @@ def _channels(spec: oiio.ImageSpec, name: str) -> tuple[list[int], int | None]:
         field="channels",
         remedy="Export it as grey or RGB, with or without alpha.",
     )
+
+
+def _bmp_declares_alpha(path: Path) -> bool:
+    """Whether the header names the bits of alpha. Else they are alpha by custom, or unused and 0 everywhere."""
+    with path.open("rb") as file:
+        header = file.read(BMP_ALPHA_MASK.stop)
+    size, compression = (int.from_bytes(header[at : at + 4], "little") for at in (14, 30))
+    has_masks = size >= BMP_ALPHA_MASK.stop - 14 and compression in BMP_BIT_FIELDS
+    return has_masks and any(header[BMP_ALPHA_MASK])
 
 
 def _png_is_complete(data: bytes) -> bool:

@@ -35,6 +35,12 @@ TIMES: dict[Kind, str] = {
 # Times that differ by no more than this fraction of the whole range are one instant.
 TIME_TOLERANCE = 1e-6
 
+# Times in any unit since any day are used. Beyond this, differences and quotients of times could overflow.
+MAX_TIME = 1e100
+
+# Times must be stored in steps of at most this fraction of the whole range: a tenth of a frame of a clip of 1000.
+TIME_RESOLUTION = 1e-4
+
 # Mean squared sine between optical axes below which they count as parallel (about half a degree).
 PARALLEL_SINE_SQUARED = 1e-4
 
@@ -56,16 +62,9 @@ def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash
     notes = list(raw.notes)
     raw_frames = [raw_frame for split in ALL_SPLITS for raw_frame in raw.splits.get(split, ())]
     for raw_frame in raw_frames:
-        position, time = np.abs(raw_frame.camera.center).max(), abs(raw_frame.time or 0.0)
-        for field, magnitude in (("camera position", position), ("time", time)):
-            if magnitude > MAX_MAGNITUDE:
-                raise CaptureError(
-                    f"is {magnitude:.3g}, beyond the limit of {MAX_MAGNITUDE:g}",
-                    file=raw_frame.image.name,
-                    field=field,
-                    remedy="Correct it in the file that lists the image.",
-                )
+        _check_magnitudes(raw_frame)
         _check_intrinsics(raw_frame)
+    _check_times(raw_frames)
     cameras = [raw_frame.camera for raw_frame in raw.splits["train"]]
     center, scale, assumptions = center_and_scale(cameras, raw.positions)
     notes += assumptions
@@ -125,6 +124,37 @@ def normalize(raw: RawCapture, *, root: Path, max_side: int | None, content_hash
         notes=tuple(map(printable, notes)),
         content_hash=content_hash,
     )
+
+
+def _check_magnitudes(raw_frame: RawFrame) -> None:
+    """Raises `CaptureError` for a camera or a time beyond all bounds."""
+    position, time = float(np.abs(raw_frame.camera.center).max()), raw_frame.time or 0.0
+    for field, value, limit in (("camera position", position, MAX_MAGNITUDE), ("time", time, MAX_TIME)):
+        if not abs(value) <= limit:  # true for NaN as well
+            raise CaptureError(
+                f"is {value:.3g}, beyond the limit of {limit:g}",
+                file=raw_frame.image.name,
+                field=field,
+                remedy="Correct it in the file that lists the image.",
+            )
+
+
+def _check_times(raw_frames: Sequence[RawFrame]) -> None:
+    """Raises `CaptureError` naming an image for times so large that float64 does not resolve their differences."""
+    timed = [(raw_frame.time, raw_frame.image.name) for raw_frame in raw_frames if raw_frame.time is not None]
+    if not timed:
+        return
+    times = [time for time, _ in timed]
+    largest, name = max(timed, key=lambda pair: abs(pair[0]))
+    step, span = float(np.spacing(abs(largest))), max(times) - min(times)
+    if span > 0 and step > TIME_RESOLUTION * span:
+        raise CaptureError(
+            f"is {largest:.17g}; numbers of this size are stored in steps of {step:.3g}, too coarse for times that "
+            f"differ by {span:.3g} in all",
+            file=name,
+            field="time",
+            remedy="Subtract the first time from all times.",
+        )
 
 
 def _check_intrinsics(raw_frame: RawFrame) -> None:

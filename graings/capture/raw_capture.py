@@ -16,7 +16,7 @@ from graings.capture.capture import Kind, Split
 from graings.capture.image_file import ImageFile
 from graings.capture.lens import Lens
 
-# Larger coordinates and times are errors of the file: differences of such numbers have too few digits left.
+# Larger coordinates are errors of the file: differences of such numbers have too few digits left.
 MAX_MAGNITUDE: Final = 1e15
 
 

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
-from pathlib import PurePosixPath
 
 from graings.capture.capture import Split
+from graings.capture.number_in_name import number_in_name
 from graings.capture.raw_capture import RawFrame
 from graings.errors import CaptureError
 
 
 def time_from_name(image: str) -> float:
-    """The last number in the file name of `image`. Raises `CaptureError` naming the image where there is none."""
-    numbers = re.findall(r"\d+", PurePosixPath(image).stem)
-    if not numbers:
+    """The number in the file name of `image`. Raises `CaptureError` naming the image where there is none."""
+    number = number_in_name(image)
+    if number is None:
         raise CaptureError(
             "the file name contains no number to take the time from",
             file=image,
             field="name",
             remedy="Rename it, add the times to the capture, or switch capture.times_from_names off.",
         )
-    return float(numbers[-1])
+    return number
 
 
 def split_held_out(

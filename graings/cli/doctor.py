@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from graings.colmap import pycolmap_remedy
 from graings.errors import GraingsError
 from graings.evaluation.perceptual import PerceptualDistances
 from graings.kernel import active_isa, available_isas
@@ -74,9 +75,9 @@ def _extras() -> Iterable[Check]:
     try:
         import pycolmap
 
-        yield "pycolmap", "ok", f"{pycolmap.__version__}: lens distortion and triangulation"
+        yield "pycolmap", "ok", f"{pycolmap.__version__}: lens distortion, triangulation, `graings capture`"
     except ImportError:
-        yield "pycolmap", "missing", "no lens distortion, no triangulation: pip install 'graings[colmap]'"
+        yield "pycolmap", "missing", f"no lens distortion, triangulation or `graings capture`: {pycolmap_remedy()}"
     for package, (extra, use) in OPTIONAL.items():
         if find_spec(package) is None:
             yield package, "missing", f"no {use}: pip install 'graings[{extra}]'"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from graings.cli.terminal import print_line, task_progress
+from graings.colmap import pycolmap_has_a_build, pycolmap_remedy
+from graings.errors import CaptureError
 from graings.footage.make_capture import make_capture
 from graings.footage.report import lines
 from graings.kernel.threads import usable_cores
@@ -22,6 +25,14 @@ def capture(
     threads: Annotated[int | None, typer.Option(min=1, help="CPU threads (default: all usable cores).")] = None,
 ) -> None:
     """Find the cameras of a video or of photographs, and write a capture that `graings train` reads."""
+    if find_spec("pycolmap") is None:  # said now, and not after the frames of a long video
+        if pycolmap_has_a_build():
+            remedy = f"Install it: {pycolmap_remedy()}."
+        else:
+            remedy = (
+                f"Make the capture on another machine, or find the cameras with COLMAP itself: {pycolmap_remedy()}."
+            )
+        raise CaptureError("finding the cameras needs the package pycolmap", file=source, remedy=remedy)
     with task_progress() as bar:
         tasks = {}
 

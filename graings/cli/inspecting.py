@@ -14,7 +14,7 @@ from graings.cli.training import Settings, setting
 from graings.config import make_config
 from graings.inspection.inspect import inspect_capture
 from graings.plan.cost import stored_calibration
-from graings.storage.files import write_bytes
+from graings.storage.files import check_writable, write_bytes
 
 
 def inspect(
@@ -27,6 +27,10 @@ def inspect(
     as_json: Annotated[bool, typer.Option("--json", help="The document instead of text.")] = False,
 ) -> None:
     """Show what is in a capture, what is suspicious about it, and what trainings would take. Nothing is trained."""
+    if picture is not None:
+        if picture.suffix.lower() != ".png":
+            raise typer.BadParameter(f"{picture} must end in .png, the format of the picture", param_hint="--picture")
+        check_writable(picture)
     config = make_config(overrides=dict(setting(text) for text in settings or ()))
     with busy_status("reading the capture, and matching its pictures"):
         document, png = inspect_capture(capture, config.capture, stored_calibration())

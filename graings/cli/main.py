@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Annotated, Any, Final, Literal, NoReturn
 
 import typer
@@ -29,7 +30,7 @@ from graings.cli.planning import plan
 from graings.cli.rendering import render_view
 from graings.cli.synthesize import synthesize
 from graings.cli.terminal import metrics_line, motion_line, print_line
-from graings.cli.training import MultiValueCommand, Threads, ablate, train
+from graings.cli.training import FULL_DISK, MultiValueCommand, Threads, ablate, train
 from graings.cli.video import video
 from graings.errors import (
     CaptureError,
@@ -60,7 +61,7 @@ EXIT_CODES: Final[tuple[tuple[type[Exception], int], ...]] = (
 OTHER_PATH: Final = "Choose another path."
 REMEDIES: Final[dict[int | None, str]] = {
     errno.ENOENT: "Check the path.",
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Free some space there; training continues with --resume."),
+    **dict.fromkeys(FULL_DISK, "Free some space there."),
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "Choose another path, or get permission for this one."),
 }
 EPILOG: Final = (
@@ -176,8 +177,12 @@ def _message(error: Exception) -> str:
         file = next((parent for parent in (path, *path.parents) if parent.is_file()), path)
         return f"{file}: is a file where a folder is needed. {OTHER_PATH}"
     if isinstance(error, OSError) and error.strerror:
-        name = "" if error.filename is None else f"{error.filename}: "  # a full disk is reported without its file
-        return f"{name}{error.strerror}. {REMEDIES.get(error.errno, OTHER_PATH)}"
+        notes = getattr(error, "__notes__", ())  # what a command adds, such as how a training goes on
+        name, remedy = f"{error.filename}: ", REMEDIES.get(error.errno, OTHER_PATH)
+        if error.filename is None:
+            full = error.errno in FULL_DISK  # libraries report it without the file
+            name, remedy = "", f"Free some space where the files go, or in {gettempdir()}." if full else remedy
+        return " ".join((f"{name}{error.strerror}. {remedy}", *notes))
     return str(error)
 
 

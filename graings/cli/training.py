@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from graings.cli.interrupt import Interrupt
 from graings.cli.progress import TrainingProgress
 from graings.cli.terminal import busy_status, metrics_line, print_line
 from graings.config import PRESETS, make_config
-from graings.plan.rules import nothing_shown
+from graings.plan.contradictions import nothing_shown
 from graings.report.metrics_document import read_metrics
 from graings.storage.checkpoint import newest_checkpoint
 from graings.storage.run_folder import RECORD_FILE
@@ -30,6 +31,7 @@ Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any option of `graings options`.")
 ]
 
+FULL_DISK: Final = (errno.ENOSPC, errno.EDQUOT)
 MULTI_VALUE: Final = ("--rows", "--seeds")
 
 
@@ -72,7 +74,7 @@ def train(
                 if (output / RECORD_FILE).exists():
                     print_line(f"Stopped before the first step. Continue with: graings train --resume -o {output}")
                 raise
-    interrupt = _take_steps(run)
+    interrupt = _take_steps(run, again=f"Then continue with: graings train --resume -o {run.folder}")
     if run.iteration < run.iterations:
         print_line(f"Stopped after {run.iteration:,} of {run.iterations:,} iterations, {kept_checkpoint(run)}.")
         print_line(f"Continue with: graings train --resume -o {run.folder}")
@@ -122,7 +124,7 @@ def ablate(
     print_line(f"{len(ablation.runs)} runs, {len(ablation.runs) - left} of them finished.")
     for job, run in ablation:
         print_line(f"{job.row.label}, seed {job.seed}: {left} to go")
-        interrupt = _take_steps(run)
+        interrupt = _take_steps(run, again="Then run the same command again to continue.")
         if run.iteration >= run.iterations:
             _print_result(run)
             left -= 1
@@ -152,8 +154,11 @@ def check_one_preset(preset: str, overrides: dict[str, Any]) -> None:
         raise typer.BadParameter(f"the preset is {preset} and {overrides['preset']}; give one of --preset and --set")
 
 
-def _take_steps(run: TrainingRun) -> Interrupt:
-    """Train to the end, or until a signal, and then save a checkpoint. Returns the interrupt."""
+def _take_steps(run: TrainingRun, again: str) -> Interrupt:
+    """Train to the end, or until a signal, and then save a checkpoint. Returns the interrupt.
+
+    `again` says how to continue after an error of a full disk.
+    """
     with (
         TrainingProgress(Console(), run.iteration, run.iterations) as progress,
         Interrupt("stopping after this step; press Ctrl-C again to stop at once") as interrupt,
@@ -161,11 +166,16 @@ def _take_steps(run: TrainingRun) -> Interrupt:
         seen = run.log.plan.statistics
         for note in (*run.capture.notes, *(() if seen is None else nothing_shown(seen))):
             progress.note(note)
-        for step in run:
-            progress.show(step)
-            if interrupt.received is not None and step.iteration < run.iterations:
-                run.save()
-                break
+        try:
+            for step in run:
+                progress.show(step)
+                if interrupt.received is not None and step.iteration < run.iterations:
+                    run.save()
+                    break
+        except OSError as error:
+            if error.errno in FULL_DISK:
+                error.add_note(again)
+            raise
     return interrupt
 
 

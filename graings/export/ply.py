@@ -1,7 +1,7 @@
 """PLY files of 3D Gaussian Splatting: the format that every tool for splats reads.
 
-A row holds x y z, f_dc_0..2 (coefficient of degree 0), f_rest_* (the others, all of red first), opacity (before the
-sigmoid), scale_0..2 (log) and rot_0..3 (w x y z). Values are those of the capture's coordinates.
+A row holds x y z, nx ny nz (0), f_dc_0..2 (coefficient of degree 0), f_rest_* (the others, all of red first), opacity
+(before the sigmoid), scale_0..2 (log) and rot_0..3 (w x y z). Values are those of the capture's coordinates.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from graings.errors import CheckpointError
 from graings.scene.splats import MAX_DEGREE, Splats
 
 _POSITION: Final = ("x", "y", "z")
+# Splats have no normals. Viewers that read rows of a fixed length, as that of the authors of 3DGS, expect them.
+_NORMAL: Final = ("nx", "ny", "nz")
 _COLOR: Final = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE: Final = ("scale_0", "scale_1", "scale_2")
 _ROTATION: Final = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -36,11 +38,12 @@ def ply_bytes(splats: Splats, units: Units) -> bytes:
     Opacities above the cap of one Gaussian's alpha become the cap, which draws the same.
     """
     rest = splats.harmonics[:, 1:].transpose(1, 2).flatten(1)
-    names = [*_POSITION, *_COLOR, *(f"f_rest_{index}" for index in range(rest.shape[1]))]
+    names = [*_POSITION, *_NORMAL, *_COLOR, *(f"f_rest_{index}" for index in range(rest.shape[1]))]
     names += ["opacity", *_SCALE, *_ROTATION]
     opacities = splats.opacities.double().clamp(_LOWEST_OPACITY, constants.ALPHA_MAX).logit()
     parts = (
         torch.from_numpy(units.points_back(splats.means.double().numpy())),
+        torch.zeros(len(splats), len(_NORMAL)),
         splats.harmonics[:, 0],
         rest,
         opacities[:, None],

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from graings.colmap import import_pycolmap
+from graings.colmap import import_pycolmap, pycolmap_remedy
 from graings.errors import CaptureError
 from graings.footage.photos import image_size
 
@@ -49,8 +49,8 @@ def reconstruct(
     try:
         pycolmap = import_pycolmap()
     except ModuleNotFoundError as error:
-        remedy = "Install it: pip install 'graings[colmap]'."
-        raise CaptureError("finding the cameras needs the package pycolmap", file=images, remedy=remedy) from error
+        what = "finding the cameras needs the package pycolmap"
+        raise CaptureError(what, file=images, remedy=f"{pycolmap_remedy()}.") from error
     database = workspace / "database.db"
     _extract(database, images, names, threads, observe)
     _match(database, names, workspace / "pairs.txt", threads, observe)

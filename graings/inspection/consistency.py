@@ -20,6 +20,7 @@ from graings.camera.camera import Camera
 from graings.camera.units import Units
 from graings.capture.capture import Frame
 from graings.capture.images import ImageStore
+from graings.colmap import pycolmap_remedy
 from graings.document import Document
 from graings.matching.features import MAX_SIFT_SIDE, Features, extract, matches, neighbours, reduced
 from graings.matching.rays import ray_intersections
@@ -99,9 +100,7 @@ def consistency(frames: Sequence[Frame], images: ImageStore, units: Units, *, op
     try:
         features = extract(chosen, images)
     except ImportError:
-        return Consistency(
-            images=0, matches=0, share=None, reason="pycolmap is not installed (pip install 'graings[colmap]')"
-        )
+        return Consistency(images=0, matches=0, share=None, reason=f"pycolmap is not installed ({pycolmap_remedy()})")
     cameras = [frame.camera for frame in chosen]
     pairs = set(neighbours(cameras, [frame.time for frame in chosen]))
     pairs |= {(one, one + step) for step in STEPS for one in range(len(chosen) - step)}

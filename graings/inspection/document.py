@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -66,8 +67,11 @@ class Inspection(Document):
         cameras = {"fixed": f"{s.cameras} fixed", "moving": "moving", "mixed": f"{s.cameras}, some fixed"}
         size = f"{self.source_size[0]}x{self.source_size[1]} px on disk, {s.width}x{s.height} as trained on"
         low, high = self.bounds
+        first, last = self.time_range or (0.0, 0.0)
         times = (
-            "no times (static)" if self.time_range is None else f"from {self.time_range[0]:g} to {self.time_range[1]:g}"
+            "no times (static)"
+            if self.time_range is None
+            else f"from {time_text(first, last - first)} to {time_text(last, last - first)}"
         )
         box = " to ".join("(" + ", ".join(f"{value:.3g}" for value in corner) + ")" for corner in (low, high))
         found = [
@@ -87,6 +91,12 @@ class Inspection(Document):
             )
             found.append(f"{preset:<12} {minutes}, about {forecast.memory_mb / 1000:.1f} GB of memory")
         return found
+
+
+def time_text(time: float, span: float) -> str:
+    """`time` with six digits of the `span` of all times: those of a clip since 1970 begin with the same ones."""
+    before = math.log10(abs(time) / span) if time and span else 0.0
+    return f"{time:.{6 + max(0, math.ceil(before))}g}"
 
 
 def _hex(color: Vector) -> str:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
-from pathlib import PurePosixPath
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from graings.capture.capture import Capture, Frame
+from graings.capture.number_in_name import number_in_name
 from graings.inspection.consistency import Consistency
-from graings.inspection.document import Finding
+from graings.inspection.document import Finding, time_text
 from graings.plan.capture_statistics import CaptureStatistics
 
 Array = NDArray[np.float64]
@@ -90,7 +89,7 @@ def _units(distance: float) -> list[Finding]:
 
 def _times(capture: Capture, statistics: CaptureStatistics) -> list[Finding]:
     found = []
-    numbered = [(_number(frame.name), frame.time) for frame in capture.train]
+    numbered = [(number_in_name(frame.name), frame.time) for frame in capture.train]
     if statistics.camera_motion == "moving" and statistics.times > 2 and all(n is not None for n, _ in numbered):
         steps = np.diff([time for _, time in sorted(numbered)])
         back = float((steps < 0).mean())
@@ -102,7 +101,8 @@ def _times(capture: Capture, statistics: CaptureStatistics) -> list[Finding]:
     steps = np.diff(capture.times)
     if len(steps) > 2 and steps.max() > LONG_GAP * np.median(steps):
         after = capture.units.time_start + capture.units.time_span * float(capture.times[int(steps.argmax())])
-        text = f"a gap of {steps.max() / np.median(steps):.0f} times the usual step follows the time {after:g}"
+        factor, place = steps.max() / np.median(steps), time_text(after, capture.units.time_span)
+        text = f"a gap of {factor:.0f} times the usual step follows the time {place}"
         found.append(Finding(about="times", text=text, remedy="Check that no part of the clip is missing."))
     return found
 
@@ -112,11 +112,6 @@ def _pictures(statistics: CaptureStatistics) -> list[Finding]:
         return []
     text = f"the {statistics.examined} training images that were looked at show one colour and nothing else"
     return [Finding(about="pictures", text=text, remedy="Check the export: there is nothing to learn from them.")]
-
-
-def _number(name: str) -> int | None:
-    numbers = re.findall(r"\d+", PurePosixPath(name).stem)
-    return int(numbers[-1]) if numbers else None
 
 
 def in_order(frames: Sequence[Frame]) -> list[Frame]:

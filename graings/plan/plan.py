@@ -14,9 +14,10 @@ from pydantic import Field
 from graings.config import TrainConfig
 from graings.document import Document
 from graings.plan.capture_statistics import CaptureStatistics
+from graings.plan.contradictions import contradictions
 from graings.plan.cost import Calibration, Prediction, predict
 from graings.plan.decision import Component, Decision, Saving
-from graings.plan.rules import contradictions, decide, has_preset_rate
+from graings.plan.rules import decide, has_preset_rate
 
 # DeformNet also helps children to find their place. Without it, three captures of one time gain 0.15 to 0.18 dB with
 # twice the first rate of the child offsets (docs/experiments/training-speed.md).

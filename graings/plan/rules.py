@@ -32,7 +32,7 @@ def decide(statistics: CaptureStatistics, config: TrainConfig) -> list[Decision]
         deformation,
         residual,
         _view_dependence(statistics, config),
-        _temporal_loss(statistics, static),
+        _temporal_loss(statistics, config, static),
         _rigidity(statistics, config, static),
         _alpha_loss(statistics, config),
         _given("random_points", statistics.points > 0, "points in the capture's cloud", statistics.points, ">"),
@@ -48,40 +48,6 @@ def has_preset_rate(config: TrainConfig) -> bool:
     return config.rates.offsets == make_config(config.preset).rates.offsets
 
 
-def nothing_shown(statistics: CaptureStatistics) -> list[str]:
-    """A warning where the training images have one colour; else none."""
-    if statistics.coverage > 0:
-        return []
-    return [
-        f"the {statistics.examined} training images that were looked at show one colour and nothing else: there is "
-        "nothing to learn, and high metrics say nothing."
-    ]
-
-
-def contradictions(statistics: CaptureStatistics, config: TrainConfig) -> tuple[str, ...]:
-    """What the capture does not show, and options that contradict what was measured, with the number."""
-    found = []
-    one, still = _single_time(statistics), _unchanged(statistics)
-    moves = statistics.times > 1 and statistics.change is not None and not still.holds
-    if statistics.times > 1 and statistics.camera_motion != "fixed" and config.scene.deformation != "none":
-        found.append(f"{MONOCULAR}. The deformation is kept.")
-    if statistics.times > 1 and statistics.camera_motion == "fixed" and statistics.change is None:
-        found.append("not every fixed camera could be looked at. The deformation is kept.")
-    found += nothing_shown(statistics)
-    if config.scene.deformation == "none" and moves:
-        found.append(f"scene.deformation is none, but {still}: what moves will be blurred.")
-    found += [
-        f"plan.keep has the {part}, but {one}: it can only learn what the other parts do as well."
-        for part in ("deformation", "residual")
-        if part in config.plan.keep and one.holds
-    ]
-    if "deformation" in config.plan.keep and statistics.times > 1 and still.holds:
-        found.append(f"plan.keep has the deformation, but {still}.")
-    if "alpha_loss" in config.plan.keep and statistics.alpha != "varying":
-        found.append(f"plan.keep has the alpha_loss, but alpha is {statistics.alpha} in all examined images.")
-    return tuple(found)
-
-
 def _kept(config: TrainConfig, part: Part) -> bool:
     return config.plan.mode == "off" or part in config.plan.keep
 
@@ -91,20 +57,25 @@ def _kept_by_option(config: TrainConfig, part: Part, condition: Condition | None
     return Decision(component=part, decision="keep", kind="user", reason=option, condition=condition)
 
 
-def _single_time(statistics: CaptureStatistics) -> Condition:
+def single_time(statistics: CaptureStatistics) -> Condition:
+    """That the training views show one instant."""
     return Condition(name="distinct training times", op="==", value=statistics.times, threshold=1)
 
 
-def _unchanged(statistics: CaptureStatistics) -> Condition:
+def unchanged(statistics: CaptureStatistics) -> Condition:
+    """That no tile of a fixed camera changes between times."""
     ratio = None if statistics.change is None else statistics.change.ratio
     return Condition(name="largest change of a tile over what noise explains", op="<=", value=ratio, threshold=1)
 
 
 def _deformation(statistics: CaptureStatistics, config: TrainConfig) -> Decision:
-    one, still = _single_time(statistics), _unchanged(statistics)
+    one, still = single_time(statistics), unchanged(statistics)
     if config.scene.deformation == "none":
         reason = "scene.deformation is none"
         return Decision(component="deformation", decision="drop", kind="user", reason=reason, condition=still)
+    if config.scene.single_mlp:
+        reason = "scene.single_mlp: the network of the shape moves it too"
+        return Decision(component="deformation", decision="keep", kind="user", reason=reason, condition=one)
     if _kept(config, "deformation"):
         return _kept_by_option(config, "deformation", one if one.holds else still)
     if one.holds:
@@ -122,7 +93,7 @@ def _deformation(statistics: CaptureStatistics, config: TrainConfig) -> Decision
 
 
 def _residual(statistics: CaptureStatistics, config: TrainConfig) -> Decision:
-    one, still = _single_time(statistics), _unchanged(statistics)
+    one, still = single_time(statistics), unchanged(statistics)
     if not config.scene.residual:
         return Decision(component="residual", decision="drop", kind="user", reason="scene.residual is off")
     if _kept(config, "residual"):
@@ -173,11 +144,13 @@ def _view_dependence(statistics: CaptureStatistics, config: TrainConfig) -> Deci
     )
 
 
-def _temporal_loss(statistics: CaptureStatistics, static: bool) -> Decision:
-    one = _single_time(statistics)
-    reason = "no pair of times" if static else f"{statistics.times} distinct training times"
+def _temporal_loss(statistics: CaptureStatistics, config: TrainConfig, static: bool) -> Decision:
+    if config.loss.temporal == 0:
+        return Decision(component="temporal_loss", decision="drop", kind="user", reason="loss.temporal is 0")
+    one = single_time(statistics)
     if static:
-        return _dropped("temporal_loss", "exact", reason, one)
+        return _dropped("temporal_loss", "exact", "no pair of times" if one.holds else "nothing moves", one)
+    reason = f"{statistics.times} distinct training times"
     return Decision(component="temporal_loss", decision="keep", kind="exact", reason=reason, condition=one)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-import pycolmap
+import pytest
 from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
@@ -142,6 +142,7 @@ def write_colmap(
 ) -> Path:
     """A COLMAP folder written by pycolmap: cameras on a ring, points in a ball, images of noise."""
     (folder / where).mkdir(parents=True, exist_ok=True)
+    pycolmap = pytest.importorskip("pycolmap")  # absent on Linux on ARM
     scene = pycolmap.Reconstruction()
     camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params), camera_id=1)
     scene.add_camera_with_trivial_rig(camera)

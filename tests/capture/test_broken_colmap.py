@@ -7,7 +7,6 @@ import struct
 import sys
 from pathlib import Path
 
-import pycolmap
 import pytest
 
 from graings.capture.load import load_capture
@@ -129,6 +128,7 @@ def test_panoramas_are_refused_with_the_way_to_cut_them(tmp_path: Path, text: bo
 
 
 def test_every_model_of_colmap_is_read_or_explained() -> None:
+    pycolmap = pytest.importorskip("pycolmap")
     known = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
     assert {number: name for number, (name, _, _) in CAMERA_MODELS.items()} | PANORAMIC_MODELS == known
 
@@ -151,8 +151,14 @@ def test_error_for_a_distorted_capture_without_pycolmap_names_the_extra(
 ) -> None:
     write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30.0, 16.0, 10.0, 0.05))
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(CaptureError, match=r"pip install graings\[colmap\]"):
+    monkeypatch.setattr("platform.machine", lambda: "x86_64")
+    with pytest.raises(CaptureError, match=r"pip install 'graings\[colmap\]'"):
         load_capture(tmp_path)
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    with pytest.raises(CaptureError, match="colmap image_undistorter") as caught:
+        load_capture(tmp_path)
+    assert "pycolmap has no build for Linux on aarch64" in caught.value.remedy
+    assert "install" not in caught.value.remedy
 
 
 def test_pinhole_capture_needs_no_pycolmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

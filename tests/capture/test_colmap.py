@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 
 from graings.capture.images import ImageStore
@@ -14,6 +13,8 @@ from graings.capture.lens import Lens
 from graings.capture.load import load_capture
 from graings.config import CaptureConfig
 from tests.capture.captures import orbit, pixels, write_colmap, write_image
+
+pycolmap = pytest.importorskip("pycolmap")
 
 SIZE = (128, 80)
 DISTORTED = [

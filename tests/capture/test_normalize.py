@@ -12,6 +12,8 @@ import pytest
 from graings.camera.camera import Camera
 from graings.capture.load import load_capture
 from graings.capture.normalize import center_and_scale, up_axis
+from graings.errors import CaptureError
+from graings.inspection.inspect import inspect_capture
 from tests.capture.captures import entry, orbit, pixels, write_dnerf, write_image, write_transforms
 
 RADIUS = 4.25  # 17 / 4: the poses below stay exact when scaled
@@ -158,3 +160,37 @@ def test_single_instant_is_time_zero(tmp_path: Path) -> None:
     assert capture.times.tolist() == [0.0]
     assert capture.units.time_span == 0.0
     assert any("one time" in note for note in capture.notes)
+
+
+@pytest.mark.parametrize("start", [0.0, 1_532_402_927.0, 1_532_402_927_647_951.0, 1_403_636_579_763_555_584.0])
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
+def test_times_since_1970_are_read_in_every_unit(tmp_path: Path, start: float, unit: float) -> None:
+    """Clips as long as `unit`: refused where float64 stores their times in too coarse steps."""
+    times = [start + unit * step / 4 for step in range(5)]
+    capture = (tmp_path / "capture").resolve()
+    if len(set(times)) == 1:
+        assert load_capture(write_dnerf(capture, times)).times.tolist() == [0.0]
+    elif start * 2.0**-52 > 1e-4 * unit:
+        with pytest.raises(CaptureError, match=r"^train/r_00\d\.png, time: ") as caught:
+            load_capture(write_dnerf(capture, times))
+        assert "Subtract" in caught.value.remedy
+    else:
+        found = load_capture(write_dnerf(capture, times)).times
+        np.testing.assert_allclose(found, np.arange(5) / 4, atol=1e-4)
+
+
+@pytest.mark.parametrize("time", [1e200, -1e308])
+def test_a_time_whose_differences_overflow_is_refused(tmp_path: Path, time: float) -> None:
+    with pytest.raises(CaptureError, match=r"^train/r_001\.png, time: is -?1e\+\d+, beyond the limit of 1e\+100"):
+        load_capture(write_dnerf(tmp_path, [0.0, time, 1.0]))
+
+
+def test_times_of_one_instant_may_be_any_number(tmp_path: Path) -> None:
+    assert load_capture(write_dnerf(tmp_path, [1.4e18] * 3)).times.tolist() == [0.0]
+
+
+def test_long_times_are_printed_with_the_digits_that_differ(tmp_path: Path) -> None:
+    start = 1_532_402_927_647_951
+    found, _ = inspect_capture(write_dnerf(tmp_path, [start + 250_000.0 * step for step in range(5)]))
+    (line,) = [line for line in found.lines() if line.startswith("times")]
+    assert f"from {start} to {start + 1_000_000}" in line

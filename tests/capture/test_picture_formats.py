@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from graings.capture.image_file import SUFFIXES
 from graings.capture.images import ImageStore
@@ -60,17 +62,78 @@ def test_pictures_of_any_format_are_read_under_a_name_without_suffix(tmp_path: P
     assert np.abs(image - smooth()).max() <= INEXACT.get(suffix.lower(), 0.1)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".webp", ".tif", ".tga"])
-def test_straight_alpha_is_premultiplied(tmp_path: Path, suffix: str) -> None:
+def seen(folder: Path) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Colour on black and alpha of the picture r_002."""
+    frame, images = load_capture(folder).train[2], ImageStore(BLACK)
+    return images.rgb(frame), images.alpha(frame)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_transparent_pixels_show_what_the_format_says(tmp_path: Path, suffix: str) -> None:
+    """Alpha from 0 to 1 over bright colours: straight in all formats but EXR, 0 or 1 in GIF, absent in JPEG."""
+    straight = np.full((12, 12, 4), (250, 120, 30, 0), np.uint8)
+    straight[..., 3] = np.arange(12) // 2 * 51
     folder = write_dnerf(tmp_path)
-    replace_image(folder, suffix, smooth(channels=4))
-    frame = load_capture(folder).train[2]
-    straight = smooth(channels=4) / 255
-    images = ImageStore(BLACK)
-    alpha = images.alpha(frame)
+    if suffix == ".gif":  # OpenImageIO writes GIFs without transparency
+        straight[..., 3] = np.where(straight[..., 3] > 100, 255, 0)
+        (folder / "train/r_002.png").unlink()
+        palette = Image.fromarray((straight[..., 3] // 255).astype(np.uint8), "P")
+        palette.putpalette([*straight[0, 0, :3], *straight[0, 0, :3]])
+        palette.save(folder / "train/r_002.gif", transparency=0)
+    elif suffix == ".exr":
+        premultiplied = straight / np.float32(255)
+        premultiplied[..., :3] *= premultiplied[..., 3:]
+        replace_image(folder, suffix, 255 * premultiplied)
+    else:
+        replace_image(folder, suffix, straight if has_alpha(suffix) else straight[..., :3])
+    color, alpha = seen(folder)
+    assert (alpha is not None) == has_alpha(suffix)
+    expected = straight / np.float32(255)
+    if alpha is not None:
+        np.testing.assert_allclose(alpha, expected[..., 3], atol=1e-3)
+        expected[..., :3] *= expected[..., 3:]
+    np.testing.assert_allclose(color, expected[..., :3], atol=INEXACT.get(suffix, 0.25) / 255)
+
+
+def has_alpha(suffix: str) -> bool:
+    return suffix not in (".jpg", ".jpeg", ".jfif")
+
+
+def bmp(path: Path, image: NDArray[np.uint8], *, declared: int | None = None) -> Path:
+    """A BMP of 32 bits per pixel with the simplest header, or the fourth that `declared` the mask of alpha."""
+    height, width = image.shape[:2]
+    pixels = image[::-1, :, [2, 1, 0, 3]].tobytes()
+    size = 40 if declared is None else 108
+    header = struct.pack(
+        "<IiiHHIIiiII", size, width, height, 1, 32, 0 if declared is None else 3, len(pixels), *[0] * 4
+    )
+    if declared is not None:
+        header += struct.pack("<IIII", 0xFF0000, 0xFF00, 0xFF, declared) + b"BGRs" + bytes(48)
+    path.write_bytes(b"BM" + struct.pack("<IHHI", 14 + size + len(pixels), 0, 0, 14 + size) + header + pixels)
+    return path
+
+
+@pytest.mark.parametrize("declared", [None, 0])
+def test_a_bmp_whose_fourth_byte_is_unused_is_opaque(tmp_path: Path, declared: int | None) -> None:
+    image = np.concatenate([smooth(), np.zeros((12, 12, 1), np.uint8)], axis=2)
+    folder = write_dnerf(tmp_path)
+    for index in range(4):
+        (folder / f"train/r_{index:03d}.png").unlink()
+        bmp(folder / f"train/r_{index:03d}.bmp", image, declared=declared)
+    assert not load_capture(folder).has_alpha
+    color, alpha = seen(folder)
+    assert alpha is None
+    np.testing.assert_allclose(color, image[..., :3] / 255, atol=1e-4)
+
+
+def test_a_bmp_whose_header_declares_alpha_may_be_empty(tmp_path: Path) -> None:
+    image = np.concatenate([smooth(), np.zeros((12, 12, 1), np.uint8)], axis=2)
+    folder = write_dnerf(tmp_path)
+    (folder / "train/r_002.png").unlink()
+    bmp(folder / "train/r_002.bmp", image, declared=0xFF000000)
+    color, alpha = seen(folder)
     assert alpha is not None
-    np.testing.assert_allclose(alpha, straight[..., 3], atol=1e-4)
-    np.testing.assert_allclose(images.rgb(frame), straight[..., :3] * straight[..., 3:], atol=1e-4)
+    assert (alpha.max(), color.max()) == (0, 0)
 
 
 @pytest.mark.parametrize("suffix", [suffix for suffix in SUFFIXES if suffix != ".tga"])

@@ -112,6 +112,22 @@ def test_a_test_list_of_a_rig_names_cameras_or_frames(tmp_path: Path, listed: st
     assert sum(len(capture.split(split)) for split in ("train", "val", "test")) == 27
 
 
+@pytest.mark.parametrize("cameras", [2, 7, 8])
+def test_cameras_are_held_out_as_a_whole_from_eight_on_or_where_a_list_names_them(tmp_path: Path, cameras: int) -> None:
+    """What docs/captures.md promises: below eight cameras without a list, every camera is trained on."""
+    folder = rig(tmp_path, cameras=cameras, times=8)
+    names = {f"frame_{10 * camera:04d}" for camera in range(cameras)}
+    capture = load_capture(folder, RIG)
+    trained, tested = ({Path(name).parent.name for name in held_out(capture, split)} for split in ("train", "test"))
+    assert (trained == names) == (cameras < 8)
+    assert tested
+    assert bool(tested & trained) == (cameras < 8)
+    (folder / "test.txt").write_text("frame_0010.png\n")
+    capture = load_capture(folder, RIG)
+    assert held_out(capture) == of_cameras("frame_0010", times=8)
+    assert "frame_0010" not in {Path(name).parent.name for name in held_out(capture, "train")}
+
+
 def test_an_unknown_name_in_the_test_list_of_a_rig_is_refused(tmp_path: Path) -> None:
     folder = rig(tmp_path)
     (folder / "test.txt").write_text("frame_0000\n")

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 
 from graings.capture.images import ImageStore
@@ -119,6 +118,7 @@ def test_times_come_from_names_when_configured_and_the_file_gives_none(tmp_path:
 def test_distorted_lenses_are_undistorted_as_pycolmap_does(
     tmp_path: Path, model: str, keys: dict[str, Any], params: tuple[float, ...]
 ) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
     y, x = np.mgrid[:40, :64]
     smooth = np.stack([x * 3.5, y * 6.0, 255 - x - y], axis=2).astype(np.uint8)
     write_single(tmp_path, 2, **keys)

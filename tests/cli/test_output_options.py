@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 from pathlib import Path
 
@@ -47,7 +49,10 @@ def test_an_option_that_a_format_does_not_use_is_refused(format: str, name: str,
 
 @pytest.mark.parametrize(
     ("command", "format"),
-    [*(("export", format) for format in (*FORMATS, *WHOLE)), ("render", "png"), ("render", "exr")],
+    [
+        *(("export", format) for format in (*FORMATS, *WHOLE)),
+        *(("render", "png"), ("render", "exr"), ("inspect", "png")),
+    ],
 )
 @pytest.mark.parametrize("place", ["missing", "a file", "a folder"])
 def test_a_place_where_no_file_can_be_is_refused_before_the_model_is_read(
@@ -73,6 +78,37 @@ def test_a_read_only_folder_is_refused_before_the_model_is_read(capsys: pytest.C
         main(["export", "absent", "-o", "/sys/a.ply"])
     assert ended.value.code == 74
     assert "/sys/a.ply: cannot be written (" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["look.jpg", "look.pdf", "look"])
+def test_a_picture_of_a_capture_under_the_name_of_another_format_is_refused(name: str, tmp_path: Path) -> None:
+    code, text = answer("inspect", tmp_path / "absent", "-o", tmp_path / name)
+    assert code == 2
+    assert f"{name}mustendin.png" in text.replace(" ", "")  # lines break anywhere in a long path
+    assert "absent" not in text
+
+
+@pytest.mark.parametrize(("command", "name"), [("render", "a.png"), ("export", "a.ply"), ("export", "a.graings")])
+def test_a_full_disk_is_said_with_the_file_and_without_a_training(
+    model: Path,
+    command: str,
+    name: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(SystemExit) as ended:
+        main([command, str(model), "-o", str(tmp_path / name)])
+    assert ended.value.code == 74
+    message = " ".join(capsys.readouterr().err.split())
+    assert message.startswith(f"{tmp_path / name}: ")
+    assert "No space left on device" in message
+    assert "resume" not in message
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,19 @@ def test_a_ply_has_the_columns_of_3dgs_in_the_captures_units() -> None:
     np.testing.assert_allclose(lengths, 1.0, rtol=1e-6)
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_ply_has_the_fixed_layout_that_the_viewer_of_the_authors_of_3dgs_reads(degree: int) -> None:
+    """It takes rows as position, normal, harmonics, opacity, scale and rotation, whatever the header says."""
+    rows = PlyData.read(io.BytesIO(WRITERS["ply"](random_splats(5, degree), UNITS)))["vertex"].data
+    rest = [f"f_rest_{index}" for index in range(3 * degree * (degree + 2))]
+    layout = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
+    layout += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert list(rows.dtype.names or ()) == layout
+    assert rows.dtype.itemsize == 4 * len(layout)
+    assert degree != 3 or rows.dtype.itemsize == 248
+    assert all((rows[name] == 0).all() for name in ("nx", "ny", "nz"))
+
+
 def glb(data: bytes) -> tuple[dict[str, Any], bytes]:
     magic, version, total = struct.unpack_from("<4sII", data)
     assert (magic, version, total) == (b"glTF", 2, len(data))

@@ -128,4 +128,7 @@ def test_without_pycolmap_the_reason_names_the_extra(
     frames: tuple[Frame, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    assert "graings[colmap]" in str(judged(frames).reason)
+    monkeypatch.setattr("platform.machine", lambda: "x86_64")
+    assert "pip install 'graings[colmap]'" in str(judged(frames).reason)
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    assert "no build for Linux on aarch64" in str(judged(frames).reason)

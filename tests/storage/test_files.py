@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 import stat
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from graings.storage.files import sync_tree, write_bytes, write_json, write_text
+from graings.errors import OutputError
+from graings.storage.files import check_writable, sync_tree, write_bytes, write_json, write_text
 
 
 def test_a_file_is_replaced_and_nothing_else_is_left(tmp_path: Path) -> None:
@@ -34,9 +38,75 @@ def test_a_number_that_json_does_not_have_leaves_the_old_file(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_other_users_may_read_a_file(tmp_path: Path) -> None:
-    write_text(tmp_path / "file", "text")
-    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o644
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
+def test_a_file_has_the_permissions_that_the_umask_leaves(tmp_path: Path, mask: int) -> None:
+    before = os.umask(mask)
+    try:
+        write_text(tmp_path / "file", "text")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o666 & ~mask
+
+
+@pytest.mark.parametrize("there", ["a file", "nothing yet"])
+def test_a_link_stays_one_and_its_target_is_written(tmp_path: Path, there: str) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "here").mkdir()
+    target, link = tmp_path / "disk/file", tmp_path / "here/link"
+    if there == "a file":
+        target.write_text("old")
+    link.symlink_to("../disk/file")
+    check_writable(link)
+    write_text(link, "new")
+    assert link.is_symlink()
+    assert target.read_text() == "new"
+    assert [path.name for folder in ("disk", "here") for path in (tmp_path / folder).iterdir()] == ["file", "link"]
+
+
+def test_a_link_into_no_folder_and_a_device_are_refused(tmp_path: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to("absent/file")
+    with pytest.raises(OutputError, match=r"link: there is no folder .*absent"):
+        check_writable(link)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OutputError, match="pipe: is no ordinary file"):
+        check_writable(tmp_path / "pipe")
+
+
+def failing(code: int) -> Callable[..., None]:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    return fail
+
+
+@pytest.mark.parametrize("call", ["open", "fsync", "replace"])
+def test_an_error_names_the_file_that_was_to_be_written(
+    tmp_path: Path, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("old")
+    with monkeypatch.context() as patched:
+        patched.setattr(os, call, failing(errno.ENOSPC))
+        with pytest.raises(OSError, match="No space left") as caught:
+            write_json(tmp_path / "file", {})
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "file"))
+    assert caught.value.filename2 is None
+    assert (tmp_path / "file").read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_error_of_a_folder_that_is_missing_names_the_file(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught:
+        write_bytes(tmp_path / "absent/file", b"")
+    assert caught.value.filename == str(tmp_path / "absent/file")
+
+
+def test_an_error_while_a_tree_is_synchronised_names_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("text")
+    monkeypatch.setattr(os, "fsync", failing(errno.EIO))
+    with pytest.raises(OSError, match="file") as caught:
+        sync_tree(tmp_path)
+    assert caught.value.filename == str(tmp_path / "file")
 
 
 def test_a_tree_can_be_synchronised(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from graings.capture.capture import Split
 from graings.capture.folder import CaptureFolder
 from graings.capture.image_file import ImageFile
 from graings.capture.listed_images import ListedImages
+from graings.capture.number_in_name import notes_on_points
 from graings.capture.orientation import image_scale, named_size, oriented
 from graings.capture.raw_capture import RawCapture, RawFrame
 from graings.capture.readers.colmap_camera import ColmapCamera, UndistortedCameras, undistortion_notes
@@ -36,7 +37,7 @@ def read_colmap(folder: CaptureFolder, config: CaptureConfig) -> RawCapture:
     """Every registered image with its undistorted camera, and the points.
 
     Times: `times.json` ({image name: time}) beside `images/`, or those of a `transforms.json` that lists the same
-    images, or with `times_from_names` the last number in the file name, else none. Masks: `masks/NAME.png`. Test split:
+    images, or with `times_from_names` the number in the file name, else none. Masks: `masks/NAME.png`. Test split:
     the names in `test.txt` beside the model, where an image of a rig stands for its whole camera, else every
     `test_every`-th by name. Val split: every `test_every`-th of the rest (`split_held_out`). Raises `CaptureError`.
     """
@@ -133,6 +134,7 @@ def _times(
             return times
     if not config.times_from_names or config.rig:
         return {}
+    notes += notes_on_points([f"{place}/{name}" for name in names])
     return {name: time_from_name(f"{place}/{name}") for name in names}
 
 

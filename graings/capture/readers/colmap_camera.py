@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
 from graings.capture.lens import Lens
+from graings.colmap import pycolmap_has_a_build, pycolmap_remedy
 from graings.errors import CaptureError
 
 # By the id in cameras.bin: name, number of parameters, number of focal lengths, which come first (cx, cy follow).
@@ -42,6 +43,7 @@ PANORAMA_REMEDY: Final = (
     "Cut each picture into perspective views with poses of their own, for example with `ns-process-data "
     "images --camera-type equirectangular` or COLMAP's script panorama_sfm."
 )
+UNDISTORTER: Final = "colmap image_undistorter"
 MODELS: Final = {name: (count, focals) for name, count, focals in CAMERA_MODELS.values()}
 
 
@@ -82,18 +84,21 @@ class ColmapCamera:
         try:
             return Lens.of(self.model, self.params, (self.width, self.height), self.distortion)
         except ImportError as error:
+            remedy = f"Undistort with `{UNDISTORTER}`: {pycolmap_remedy()}."
+            if pycolmap_has_a_build():
+                remedy = f"Install it with `{pycolmap_remedy()}`, or undistort with `{UNDISTORTER}`."
             raise CaptureError(
                 f"the camera model {self.model} must be undistorted, which needs pycolmap",
                 file=file,
                 field=field,
-                remedy="Install it with `pip install graings[colmap]`, or undistort with `colmap image_undistorter`.",
+                remedy=remedy,
             ) from error
         except ValueError as error:
             raise CaptureError(
                 f"the camera {self.model} {self.params} cannot be undistorted ({error})",
                 file=file,
                 field=field,
-                remedy="Undistort with `colmap image_undistorter` and give its output.",
+                remedy=f"Undistort with `{UNDISTORTER}` and give its output.",
             ) from error
 
 

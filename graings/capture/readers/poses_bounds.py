@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from graings.capture.folder import CaptureFolder
 from graings.capture.image_file import ImageFile
+from graings.capture.number_in_name import notes_on_points
 from graings.capture.orientation import image_scale, named_size, oriented
 from graings.capture.raw_capture import RawCapture, RawFrame
 from graings.capture.readers.array_file import read_array
@@ -35,12 +36,12 @@ def read_poses_bounds(folder: CaptureFolder, config: CaptureConfig) -> RawCaptur
     cameras = UndistortedCameras(FILE)
     frames: dict[str, RawFrame] = {}
     sources, is_rig = _sources(folder, len(rows), config.rig)
+    timed = is_rig or config.times_from_names
     for index, (row, files) in enumerate(zip(rows, sources, strict=True)):
         pose, (height, width, focal) = _pose(row, index)
         for file in files:
             image = oriented(folder.image(file, source=FILE), width, height, config.orientation)
             camera = _camera(image, width, height, focal, index)
-            timed = is_rig or config.times_from_names
             frames[image.name] = RawFrame(
                 image,
                 cameras.of(camera, pose, f"row {index}")[0],
@@ -49,6 +50,8 @@ def read_poses_bounds(folder: CaptureFolder, config: CaptureConfig) -> RawCaptur
     notes = [f"{FILE} says nothing about distortion: the images are used as they are"]
     if is_rig:
         notes.append(f"a rig of {len(rows)} cameras with a folder of frames each; numbers in file names are times")
+    if timed:
+        notes += notes_on_points(list(frames))
     splits = split_held_out(frames, config.test_every, notes, source=FILE)
     return RawCapture("llff", splits, tuple(notes))
 

@@ -9,6 +9,7 @@ from typing import Final
 
 from graings.capture.folder import CaptureFolder
 from graings.capture.image_file import SUFFIXES, ImageFile
+from graings.capture.number_in_name import notes_on_points
 from graings.capture.raw_capture import RawFrame
 from graings.capture.splits import time_from_name
 from graings.config import CaptureConfig
@@ -74,6 +75,7 @@ def with_rig(
         of_image[name] = tuple(image.name for image in images)
     if frames:
         notes.append(f"a rig: {len(timed)} frames of {len(frames)} cameras, with the numbers in their names as times")
+        notes += notes_on_points(list(timed))
     return RigFrames(timed, of_image)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from graings.capture.capture import ALL_SPLITS, SPLITS, Split
 from graings.capture.folder import CaptureFolder
 from graings.capture.listed_images import ListedImages
+from graings.capture.number_in_name import notes_on_points
 from graings.capture.raw_capture import RawCapture, RawFrame
 from graings.capture.readers.colmap_camera import undistortion_notes
 from graings.capture.readers.ply import read_ply
@@ -144,6 +145,8 @@ def _frames(
         time = time_from_name(image.name) if times_from_names else entry.time
         frames.append(RawFrame(image, camera, time, lens, mask))
     notes += images.notes(optional=optional)
+    if times_from_names:
+        notes += notes_on_points([frame.image.name for frame in frames])
     notes += scale_notes(scales, file)
     return tuple(frames)
 
