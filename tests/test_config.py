@@ -22,12 +22,20 @@ from graings.errors import ConfigError
         ("init.voxel_size", 1e-30),
         ("loss.rigidity", -0.1),
         ("iterations", 0),
+        ("warmup", 30_000),
+        ("time_window_until", 30_001),
+        ("low_resolution_until", 30_001),
         ("loss.ssim", float("nan")),
     ],
 )
 def test_a_value_outside_its_bounds_is_refused_by_name(key: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=key.replace(".", r"\.")):
         make_config("draft", {key: value})
+
+
+def test_one_network_for_shape_and_motion_needs_motion() -> None:
+    with pytest.raises(ConfigError, match=r"scene.*single_mlp moves the Gaussians.*Set one only"):
+        make_config("draft", {"scene.single_mlp": True, "scene.deformation": "none"})
 
 
 def nested(depth: int) -> dict[str, Any]:

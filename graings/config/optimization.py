@@ -51,7 +51,7 @@ class DensityConfig(ConfigSection):
     )
     prune_from: int = Field(24_600, ge=0, description="Iteration of the first pruning, in a schedule of 30 000.")
     prune_until: int = Field(29_000, ge=0, description="Iteration of the last pruning, in a schedule of 30 000.")
-    prune_every: int = Field(500, ge=1, description="Iterations between prunings.")
+    prune_every: int = Field(500, ge=1, description="Iterations between prunings, in a schedule of 30 000.")
     prune_opacity: float = Field(
         0.005, ge=0, description="Anchors whose summed child opacity stays below this are removed."
     )

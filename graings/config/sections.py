@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from graings.constants import MAX_IMAGE_SIDE
 
@@ -108,7 +108,10 @@ class SceneConfig(ConfigSection):
         "StaticMLP's alone, in units of the scene's extent, as in Eq. 5.",
     )
     stop_gradient: bool = Field(True, description="Stop the gradient from DeformNet to the canonical position (Eq. 7).")
-    single_mlp: bool = Field(False, description="Ablation: a single network for canonical geometry and deformation.")
+    single_mlp: bool = Field(
+        False,
+        description="Ablation: a single network for canonical geometry and deformation. It needs `deformation`.",
+    )
     residual: bool = Field(True, description="Temporal appearance residual (Eq. 12).")
     residual_sh_degree: int = Field(
         2,
@@ -147,6 +150,14 @@ class SceneConfig(ConfigSection):
     projected_clip: bool = Field(
         True, description="Let clipped values receive gradients that move them back into their range."
     )
+
+    @model_validator(mode="after")
+    def _single_mlp_moves(self) -> SceneConfig:
+        if self.single_mlp and self.deformation == "none":
+            raise ValueError(
+                "single_mlp moves the Gaussians, and deformation=none says that nothing moves. Set one only."
+            )
+        return self
 
 
 class InitConfig(ConfigSection):

@@ -27,7 +27,10 @@ class TrainConfig(ConfigSection):
         "once per step, and learning rates are multiplied by the cube root of the batch.",
     )
     warmup: int = Field(
-        1_000, ge=0, description="Length of the static warm-up T_w, in a schedule of 30 000; the paper has 3 000."
+        1_000,
+        ge=0,
+        lt=PAPER_ITERATIONS,
+        description="Length of the static warm-up T_w, in a schedule of 30 000; the paper has 3 000.",
     )
     average_from: int = Field(
         29_000,
@@ -44,11 +47,15 @@ class TrainConfig(ConfigSection):
         "missing later, training restarts with a smaller one.",
     )
     time_window_until: int = Field(
-        7_500, ge=0, description="Iteration, in a schedule of 30 000, at which the time window covers the whole clip."
+        7_500,
+        ge=0,
+        le=PAPER_ITERATIONS,
+        description="Iteration, in a schedule of 30 000, at which the time window covers the whole clip.",
     )
     low_resolution_until: int = Field(
         0,
         ge=0,
+        le=PAPER_ITERATIONS,
         description="Iteration, in a schedule of 30 000, until which training uses reduced images: half of each side, "
         "a quarter before that, and so on, as long as 200 px remain. 0: full resolution from the start.",
     )

@@ -77,10 +77,13 @@ class SplitMetrics(SplitMeans):
     views: tuple[ViewMetrics, ...] = Field(description="The views, in the order of the split.")
 
     @staticmethod
-    def over(views: Sequence[ViewMetrics], distances: PerceptualDistances | None = None) -> SplitMetrics:
-        """Average `views`; `distances` are those that were measured on them, None for none."""
+    def over(
+        views: Sequence[ViewMetrics],
+        distances: PerceptualDistances | None = None,
+        reason: str = "the split has no images",
+    ) -> SplitMetrics:
+        """Average `views`; `distances` are those that were measured on them, `reason` is why there is no view."""
         if not views:
-            reason = "the split has no images"
             return SplitMetrics(
                 psnr=None,
                 ssim_3dgs=None,
@@ -112,8 +115,13 @@ class SplitMetrics(SplitMeans):
 
 def measure_split(pairs: Iterable[Pair], distances: PerceptualDistances | None = None) -> SplitMetrics:
     """Metrics of a split, one pair in memory at a time. Images that are masked everywhere are left out."""
-    views = [measure(pair, distances) for pair in pairs if pair.valid is None or pair.valid.any()]
-    return SplitMetrics.over(views, distances)
+    views, masked = list[ViewMetrics](), 0
+    for pair in pairs:
+        if pair.valid is None or pair.valid.any():
+            views.append(measure(pair, distances))
+        else:
+            masked += 1
+    return SplitMetrics.over(views, distances, *(["masks hide all pixels of the split's images"] if masked else []))
 
 
 def measure(pair: Pair, distances: PerceptualDistances | None = None) -> ViewMetrics:

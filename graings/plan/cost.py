@@ -16,6 +16,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field, ValidationError
 
+import graings
 from graings.config import TrainConfig
 from graings.document import Document
 from graings.errors import CheckpointError
@@ -178,6 +179,7 @@ def stored_calibration(folder: Path | None = None) -> Calibration | None:
     """The calibration kept in `folder` (None: the cache folder); None without one, or with one of another version."""
     file = (folder or cache_folder()) / CALIBRATION_FILE
     try:
-        return Calibration.model_validate_json(file.read_text(encoding="utf-8"))
+        stored = Calibration.model_validate_json(file.read_text(encoding="utf-8"))
     except (OSError, ValidationError, ValueError, CheckpointError):
         return None  # it is measured again when a plan is asked for
+    return stored if stored.version == graings.__version__ else None

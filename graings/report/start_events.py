@@ -23,14 +23,20 @@ class BackgroundFound(TrainingEvent):
 
 
 class PointsInitialized(TrainingEvent):
-    """Where the first anchors come from, in a capture without point cloud whose masks cover the whole image."""
+    """Where the first anchors come from, in a capture without point cloud whose masks do not tell."""
 
     kind: Literal["initial_points"] = Field("initial_points", description=KIND)
     source: Literal["random", "triangulation"] = Field(
         description="random: uniform in a cube. triangulation: matched between pairs of images."
     )
     triangulated: int | None = Field(
-        ge=0, description="Points matched between pairs of images; null without the extra graings[colmap]."
+        None,
+        ge=0,
+        description="Points matched between pairs of images; null where that was not tried, or not without the extra "
+        "graings[colmap].",
+    )
+    within_masks: int | None = Field(
+        None, ge=0, description="Random points within the masks, where these were too few; null where masks are full."
     )
     interpolated: int = Field(0, ge=0, description="Points added between the triangulated ones.")
 
@@ -38,10 +44,15 @@ class PointsInitialized(TrainingEvent):
         if self.source == "triangulation":
             count, between = f"{self.triangulated:,}", f"{self.interpolated:,}"
             return f"initial points: {count} triangulated from pairs of images, {between} interpolated between them"
+        if self.within_masks is not None:
+            return (
+                f"initial points: random, because only {self.within_masks} of those in view lie within the masks; "
+                "check the cameras, or raise init.points if the objects are small in the images"
+            )
         if self.triangulated is None:
             return (
                 "initial points: random, because there is neither a point cloud nor a mask; "
-                "with the extra graings[colmap] they are triangulated from the images"
+                "with the extra graings[colmap], where pycolmap has a build, they are triangulated from the images"
             )
         return f"initial points: random, because only {self.triangulated} could be triangulated from pairs of images"
 

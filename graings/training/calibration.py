@@ -52,11 +52,10 @@ def calibration(threads: int | None = None, folder: Path | None = None) -> Calib
     or number of threads.
     """
     place = folder or cache_folder()
+    kept = kept_calibration(threads, place)
+    if kept is not None:
+        return kept
     with computing_threads(threads) as count:
-        kept = stored_calibration(place)
-        same = (graings.__version__, machine_facts().cpu, count)
-        if kept is not None and (kept.version, kept.cpu, kept.threads) == same:
-            return kept
         measured = measure_calibration(count)
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -64,6 +63,14 @@ def calibration(threads: int | None = None, folder: Path | None = None) -> Calib
     except OSError as error:
         LOG.warning("%s: the times of this machine cannot be kept and are measured each time (%s)", place, error)
     return measured
+
+
+def kept_calibration(threads: int | None = None, folder: Path | None = None) -> Calibration | None:
+    """The calibration that `calibration` would take from `folder`; None where it would measure."""
+    kept = stored_calibration(folder)
+    with computing_threads(threads) as count:
+        same = kept is not None and (kept.cpu, kept.threads) == (machine_facts().cpu, count)
+    return kept if same else None
 
 
 def measure_calibration(threads: int) -> Calibration:

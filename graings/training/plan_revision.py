@@ -10,7 +10,7 @@ from graings.plan.decision import Component, Decision, Saving
 from graings.plan.plan import Plan
 from graings.plan.rules import QUIET_GROWTHS
 from graings.plan.tile_change import HALF_LEVEL
-from graings.report.events import Event, GrowthQuiet, PartDropped
+from graings.report.events import Event, Grew, GrowthCapped, GrowthQuiet, PartDropped
 from graings.storage.files import write_document
 from graings.storage.run_folder import PLAN_FILE
 from graings.training.residual_bound import residual_bound
@@ -43,6 +43,8 @@ class PlanRevision:
         for event in step.events:
             if isinstance(event, GrowthQuiet):
                 self._note_growth(event)
+            if isinstance(event, Grew | GrowthCapped) and self._planned_again("growth"):
+                self._write_timed()
 
     def return_to(self, trainer: Trainer) -> None:
         """Training went back to an earlier scene: what it has left out since then is there again, and in the plan."""
@@ -51,13 +53,17 @@ class PlanRevision:
             "growth": trainer.quiet_growths < QUIET_GROWTHS,
         }
         for component, present in there.items():
-            planned, decision = self._planned.decision(component), self.plan.decision(component)
-            if present and planned is not None and decision is not None and decision.decision != planned.decision:
-                self.log.plan = self.plan.revised(planned)
-                if component == "residual":
-                    self.log.residual_unseen, self._before = 0, None
-        with self.log.clock.timed("report"):
-            self.write()
+            if present and self._planned_again(component) and component == "residual":
+                self.log.residual_unseen, self._before = 0, None
+        self._write_timed()
+
+    def _planned_again(self, component: Component) -> bool:
+        """Take back what training has decided about a component; whether there was anything."""
+        planned, decision = self._planned.decision(component), self.plan.decision(component)
+        if planned is None or decision is None or decision.decision == planned.decision:
+            return False
+        self.log.plan = self.plan.revised(planned)
+        return True
 
     def begin_again(self) -> None:
         """Training starts again: what it has found was about the scene before."""
@@ -147,9 +153,12 @@ class PlanRevision:
             "decision": "drop" if event.ended else "propose",
             "iteration": event.iteration,
             "condition": condition,
-            "reason": f"no anchor was added from there on in {event.growths} growths",
+            "reason": f"the {event.growths} growths up to this iteration added no anchor",
         }
         self.log.plan = self.plan.revised(decision.model_copy(update=update))
+        self._write_timed()
+
+    def _write_timed(self) -> None:
         with self.log.clock.timed("report"):
             self.write()
 

@@ -18,13 +18,13 @@ from graings.config import TrainConfig
 from graings.errors import CheckpointError, DivergedError, GraingsError
 from graings.kernel import computing_threads
 from graings.plan.capture_statistics import measure
-from graings.plan.cost import stored_calibration
 from graings.plan.plan import Plan, make_plan
 from graings.report.events import Diverged, Event, RolledBack
 from graings.report.metrics_document import EvaluationPoint
 from graings.report.run_record import read_record
 from graings.storage.checkpoint import intact, load_training, newest_checkpoint
 from graings.storage.run_folder import METRICS_FILE, RECORD_FILE, check_unused, sole_trainer
+from graings.training.calibration import kept_calibration
 from graings.training.curriculum.missing_motion import MissingMotion, check_iteration
 from graings.training.curriculum.restart import RestartState
 from graings.training.density.unseen import drop_unseen
@@ -60,12 +60,12 @@ class TrainingRun:
         seen = with_background(config.capture, capture)
         self.images = ImageStore(seen.background_rgb(), seen.cache_mb)
         if plan is None:
-            plan = make_plan(measure(capture, self.images, seen.background_rgb()), config, stored_calibration())
+            statistics = measure(capture, self.images, seen.background_rgb())
+            plan = make_plan(statistics, config, kept_calibration(self.threads))
         self.applied = plan.apply(config).model_copy(update={"capture": seen})
         self.log = TrainingLog(folder, capture, config, plan, clock)
         self.revision = PlanRevision(self.log)
         self.output = RunOutput(folder, self.images, self.log)
-        self._best_psnr: float | None = None
 
     @classmethod
     def create(cls, capture: Path, folder: Path, config: TrainConfig) -> TrainingRun:
@@ -123,8 +123,8 @@ class TrainingRun:
                 state.facts["trainer"],
                 run._restart.iterations_before,
             )
-            run.log.load(state.facts)
-        run._best_psnr = psnr_of_best(folder, run._restart)
+            run.log.load(state.facts, extended=model.config.iterations != config.iterations)
+        run.output.best_psnr = psnr_of_best(folder, run._restart)
         return run
 
     def _start(self, restart: RestartState | None = None, tracks: MotionTracks | None = None) -> None:
@@ -136,7 +136,7 @@ class TrainingRun:
             config = restart.config(self.applied)
             self._trainer = Trainer.start(self.capture, self.images, config, restart.iterations_before, tracks)
         self._restart = restart
-        self._best_psnr = None
+        self.output.best_psnr = None
 
     @property
     def iteration(self) -> int:
@@ -198,9 +198,10 @@ class TrainingRun:
             if last:
                 point, more = self._finish()
                 events += more
+            now = {"gaussians": self.log.gaussians, "anchors": self._trainer.scene.scaffold.count}
             yield RunReport(
                 **{part.name: getattr(step, part.name) for part in fields(step)}
-                | {"events": step.events + events, "anchors": self._trainer.scene.scaffold.count},
+                | {"events": step.events + events, **now},
                 iterations_per_s=rate.per_second(),
                 train_s=self.log.clock.train_s(),
                 evaluation=point,
@@ -262,12 +263,10 @@ class TrainingRun:
 
     def _evaluate(self) -> EvaluationPoint | None:
         point = self.output.evaluate(self._trainer, self.iteration)
-        if point is None:
-            return None
-        if self._best_psnr is None or point.psnr > self._best_psnr:
-            self._best_psnr = point.psnr
-            self._save(best=True)
-        self.output.write_metrics(self._trainer, self.iteration, self.iterations, {})
+        if point is not None:
+            if self.output.is_best(point):
+                self._save(best=True)
+            self.output.write_metrics(self._trainer, self.iteration, self.iterations, {})
         return point
 
     def _finish(self) -> tuple[EvaluationPoint | None, tuple[Event, ...]]:
@@ -278,6 +277,8 @@ class TrainingRun:
         events += (stiffness := self.output.stiffness(trainer)).events(self.iteration)
         self.log.note(events)
         self._save(finished=True)
+        if point is not None and self.output.is_best(point):
+            self._save(finished=True, best=True)
         compact = self.output.export(trainer)
         self.revision.finish(self.iteration, self.output.view_dependence(trainer))
         self.output.write_metrics(trainer, self.iteration, self.iterations, splits, compact, stiffness)
@@ -291,7 +292,7 @@ class TrainingRun:
         trainer = self._trainer
         self.log.note([Diverged(iteration=self.iteration, reason=reason)])
         self.log.diverged = reason
-        self.output.return_to_best(trainer, self._best_psnr)
+        self.output.return_to_best(trainer)
         self.revision.return_to(trainer)
         splits = self.output.splits(trainer)
         self._save(instead_of_later=True)

@@ -48,13 +48,14 @@ class RunOutput:
     images: ImageStore
     log: TrainingLog
     render_fps: float | None = None  # of the newest evaluation; None before the first
+    best_psnr: float | None = None  # of the best evaluation since the last restart, in dB
 
     def held_out(self) -> tuple[Frame, ...]:
         """Validation views of the curve; never test views."""
         return subset(self.log.capture.val, self.log.config.evaluation.views)
 
     def evaluate(self, trainer: Trainer, iteration: int) -> EvaluationPoint | None:
-        """Measure the held-out views and add a point to the curve; None where the capture has none."""
+        """Measure the held-out views and add a point to the curve; None where there are none to compare."""
         frames = self.held_out()
         if not frames:
             return None
@@ -102,7 +103,9 @@ class RunOutput:
         self.render_fps = held_out.frames_per_second
         return held_out
 
-    def _point(self, trainer: Trainer, iteration: int, metrics: SplitMetrics, share: float | None) -> EvaluationPoint:
+    def _point(
+        self, trainer: Trainer, iteration: int, metrics: SplitMetrics, share: float | None
+    ) -> EvaluationPoint | None:
         stiffness = Stiffness(trainer.step_over_size, share, len(metrics.views))
         return self.log.point(iteration, metrics, trainer.scene.scaffold.count, stiffness)
 
@@ -123,17 +126,21 @@ class RunOutput:
         """Mean PSNR of the scene as it is over `frames`, in dB."""
         return evaluate(trainer.scene, frames, self.images, trainer.background).psnr
 
-    def return_to_best(self, trainer: Trainer, best_psnr: float | None) -> None:
-        """Return to the last snapshot or to the best evaluation, whichever has the higher held-out PSNR.
+    def is_best(self, point: EvaluationPoint) -> bool:
+        """Whether no evaluation since the last restart had a higher PSNR; from now on this point is among them."""
+        if self.best_psnr is not None and point.psnr <= self.best_psnr:
+            return False
+        self.best_psnr = point.psnr
+        return True
 
-        `best_psnr` is that of the best evaluation, None where there is none.
-        """
+    def return_to_best(self, trainer: Trainer) -> None:
+        """Return to the last snapshot or to the best evaluation, whichever has the higher held-out PSNR."""
         guard = trainer.guard
         trainer.restore()
         best, frames = best_checkpoint(self.folder), self.held_out()
-        if best is not None and best_psnr is not None and frames:
+        if best is not None and self.best_psnr is not None and frames:
             now = self.psnr(trainer, frames)
-            if now is None or best_psnr >= now:
+            if now is None or self.best_psnr >= now:
                 state = load_state(best)
                 trainer.adopt(load_model(best).scene, state.tensors, state.facts["trainer"], guard)
                 self.log.gaussians = int(state.facts["gaussians"])

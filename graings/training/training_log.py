@@ -85,10 +85,12 @@ class TrainingLog:
         """Keep what happened."""
         self.events += events
 
-    def point(self, iteration: int, metrics: SplitMetrics, anchors: int, stiffness: Stiffness) -> EvaluationPoint:
-        """Add the held-out `metrics` at `iteration` to the curve. Raises `ValueError` without a view."""
+    def point(
+        self, iteration: int, metrics: SplitMetrics, anchors: int, stiffness: Stiffness
+    ) -> EvaluationPoint | None:
+        """Add the held-out `metrics` at `iteration` to the curve; None where masks leave no view to compare."""
         if metrics.psnr is None or metrics.ssim_3dgs is None:
-            raise ValueError("a point of the curve needs at least one view")
+            return None
         point = EvaluationPoint(
             iteration=iteration,
             train_s=self.clock.train_s(),
@@ -119,14 +121,17 @@ class TrainingLog:
             residual_unseen=self.residual_unseen,
         ).to_json()
 
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `state()` gave; other keys are ignored. Raises `KeyError` or `ValueError`."""
+    def load(self, state: Mapping[str, Any], *, extended: bool = False) -> None:
+        """Continue from what `state()` gave; other keys are ignored. Raises `KeyError` or `ValueError`.
+
+        The predicted cost of a run that was extended since is not that of its new length: it is left out.
+        """
         values = LogState.model_validate({name: state[name] for name in LogState.model_fields})
         self.clock = Clock(dict(values.seconds), values.wall_s, values.train_cpu_s)
         self.curve = list(values.curve)
         self.events = list(values.events)
         self.gaussians = values.gaussians
-        self.plan = values.plan
+        self.plan = values.plan.model_copy(update={"prediction": None}) if extended else values.plan
         self.residual_unseen = values.residual_unseen
 
     def is_complete(self, iterations: int) -> bool:

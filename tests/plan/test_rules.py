@@ -79,6 +79,33 @@ def test_a_rate_that_was_set_is_not_doubled() -> None:
     assert "rate" not in decision.reason
 
 
+@pytest.mark.parametrize(
+    ("component", "option"),
+    [("temporal_loss", "loss.temporal"), ("rigidity", "loss.rigidity"), ("alpha_loss", "loss.alpha")],
+)
+def test_a_loss_that_is_switched_off_is_the_users_decision(component: Any, option: str) -> None:
+    decision = plan_of(**{option: 0.0}).decision(component)
+    assert decision is not None
+    assert (decision.decision, decision.kind, decision.reason) == ("drop", "user", f"{option} is 0")
+
+
+def test_a_scene_without_deformation_has_no_temporal_loss_because_nothing_moves() -> None:
+    decision = plan_of(**{"scene.deformation": "none"}).decision("temporal_loss")
+    assert decision is not None
+    assert (decision.decision, decision.reason) == ("drop", "nothing moves")
+
+
+@pytest.mark.parametrize("times", [1, 8])
+def test_one_network_for_shape_and_motion_keeps_the_motion(times: int) -> None:
+    """The deformation is that network: there is nothing to leave out, and the schedule has both phases."""
+    config = make_config("draft", {"scene.single_mlp": True})
+    plan = make_plan(FACTS.model_copy(update={"times": times}), config)
+    assert verdict(plan, "deformation") == ("keep", "user")
+    applied = plan.apply(config)
+    assert (applied.scene.deformation, applied.rates.offsets) == ("child", config.rates.offsets)
+    assert verdict(plan, "temporal_loss")[0] == ("drop" if times == 1 else "keep")
+
+
 def test_two_times_keep_them() -> None:
     """The counter-scene of the test above."""
     plan = plan_of({"times": 2, **MONOCULAR})

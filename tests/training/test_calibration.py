@@ -10,8 +10,9 @@ import graings
 from graings.config import make_config
 from graings.plan.cost import CALIBRATION_FILE, TERMS, Calibration, Load, predict, stored_calibration
 from graings.plan.plan import make_plan
+from graings.storage.files import write_document
 from graings.training import calibration as module
-from graings.training.calibration import calibration
+from graings.training.calibration import calibration, kept_calibration
 from tests.plan.test_rules import FACTS
 
 MADE = Calibration(
@@ -56,10 +57,17 @@ def test_a_calibration_of_another_version_or_thread_count_is_not_used(
     assert asked == [1]
     calibration(2, tmp_path)
     assert asked == [1, 2]
+    assert kept_calibration(2, tmp_path) == stored_calibration(tmp_path) is not None
+    assert kept_calibration(1, tmp_path) is None
     file = tmp_path / CALIBRATION_FILE
-    file.write_text(file.read_text().replace(graings.__version__, "0.0.0"))
+    made = file.read_text()
+    file.write_text(made.replace(graings.__version__, "0.0.0"))
+    assert stored_calibration(tmp_path) is None
+    assert kept_calibration(2, tmp_path) is None
     calibration(2, tmp_path)
     assert asked == [1, 2, 2]
+    write_document(file, MADE.model_copy(update={"cpu": "of another machine", "threads": 2}))
+    assert kept_calibration(2, tmp_path) is None
 
 
 def test_a_damaged_calibration_counts_as_none(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_the_best_evaluation_wins_over_a_worse_snapshot(
     with pytest.raises(DivergedError):
         list(steps)
     assert load_model(folder).iteration == 45
-    assert _document(folder)["splits"]["val"]["psnr"] == pytest.approx(run._best_psnr, abs=1.0)
+    assert _document(folder)["splits"]["val"]["psnr"] == pytest.approx(run.output.best_psnr, abs=1.0)
 
 
 def test_a_run_that_diverges_before_any_evaluation_keeps_its_initial_scene(

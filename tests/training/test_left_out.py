@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,18 @@ import torch
 from graings.capture.synthetic import write_synthetic
 from graings.errors import DivergedError
 from graings.plan.capture_statistics import measure
+from graings.plan.cost import Prediction
 from graings.plan.plan import make_plan
 from graings.plan.rules import QUIET_GROWTHS
 from graings.plan.tile_change import HALF_LEVEL
 from graings.render import render
-from graings.report.events import Diverged, GrowthQuiet, PartDropped, Restarted, RolledBack
+from graings.report.events import Diverged, Grew, GrowthQuiet, PartDropped, Restarted, RolledBack
 from graings.report.metrics_document import read_metrics
-from graings.report.run_record import read_plan
+from graings.report.run_record import read_plan, read_record
 from graings.scene.scene import Scene
 from graings.storage.checkpoint import load_model
+from graings.storage.files import write_document
+from graings.storage.run_folder import RECORD_FILE
 from graings.training.curriculum import missing_motion
 from graings.training.curriculum.missing_motion import MissingMotion
 from graings.training.residual_bound import residual_bound
@@ -340,6 +344,43 @@ def test_a_run_stopped_after_its_growth_went_quiet_says_so_in_its_plan(capture: 
         decision = plan.decision("growth")
         assert decision is not None
         assert (decision.decision, decision.iteration) == ("drop", quiet[0].iteration)
+
+
+def test_growth_that_begins_again_is_in_the_plan_as_it_was(capture: Path, tmp_path: Path) -> None:
+    run = TrainingRun.create(capture, tmp_path / "run", micro_config(**{**QUIET, "plan.mode": "safe"}))
+    planned = run.revision.plan.decision("growth")
+    for report in run:
+        if any(isinstance(event, GrowthQuiet) for event in report.events):
+            break
+    quiet = read_plan(tmp_path / "run")
+    assert quiet is not None
+    decision = quiet.decision("growth")
+    assert decision is not None
+    assert (decision.decision, decision.iteration) == ("propose", report.iteration)
+    assert decision.reason == f"the {QUIET_GROWTHS} growths up to this iteration added no anchor"
+    run.revision.note(replace(report, events=(Grew(iteration=report.iteration + 5, anchors=3),)))
+    again = read_plan(tmp_path / "run")
+    assert again is not None
+    assert again.decision("growth") == planned
+
+
+def test_a_run_that_was_extended_has_no_prediction_of_its_old_length(capture: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    run = TrainingRun.create(capture, folder, micro_config(iterations=10))
+    prediction = Prediction(cpu_s=60.0, minutes=1.0, threads=1, gaussians=100)
+    run.log.plan = run.log.plan.model_copy(update={"prediction": prediction})
+    list(run)
+    finished = read_plan(folder)
+    assert finished is not None
+    assert finished.prediction is not None
+    assert finished.prediction.error is not None
+    record = read_record(folder)
+    for iterations, kept in ((10, True), (12, False)):
+        longer = record.config.model_copy(update={"iterations": iterations})
+        write_document(folder / RECORD_FILE, record.model_copy(update={"config": longer}))
+        resumed = TrainingRun.resume(folder)
+        assert (resumed.revision.plan.prediction is not None) == kept
+        list(resumed)
 
 
 def test_a_budget_that_is_used_up_does_not_count_as_nothing_to_grow(capture: Path) -> None:

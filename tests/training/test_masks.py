@@ -10,9 +10,12 @@ import pytest
 import torch
 
 from graings.evaluation.evaluate import evaluate
+from graings.report.folder import report_runs
+from graings.report.metrics_document import read_metrics
+from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
 from tests.capture.captures import entry, orbit, write_image, write_transforms
-from tests.training.micro import GROWING, micro_trainer, steps
+from tests.training.micro import GROWING, micro_config, micro_trainer, steps
 
 COUNT, SIZE, STEPS = 9, 32, 60
 
@@ -83,3 +86,17 @@ def test_an_image_that_is_masked_everywhere_is_trained_on_without_effect(tmp_pat
     assert all(np.isfinite(step.loss) for step in steps(trainer, 20))
     assert evaluate(trainer.scene, trainer.capture.val, trainer.images, (1.0, 1.0, 1.0)).psnr is None
     json.dumps(evaluate(trainer.scene, trainer.capture.val, trainer.images, (1.0, 1.0, 1.0)).to_json(), allow_nan=False)
+
+
+def test_a_run_whose_only_validation_view_is_masked_everywhere_ends_and_gives_the_reason(tmp_path: Path) -> None:
+    capture = write_masked(tmp_path / "capture", 1)
+    write_image(capture / "masks/4.png", np.zeros((SIZE, SIZE, 1), np.uint8))
+    run = TrainingRun.create(capture, tmp_path / "run", micro_config(iterations=12))
+    assert [report.evaluation for report in run] == [None] * 12
+    metrics = read_metrics(run.metrics_path)
+    assert metrics.curve == ()
+    assert (metrics.splits["val"].psnr, metrics.splits["val"].views) == (None, ())
+    assert metrics.splits["val"].reason == "masks hide all pixels of the split's images"
+    report_runs([run.folder], tmp_path / "report", render=False)
+    resumed = list(TrainingRun.resume(run.folder))
+    assert [report.iteration for report in resumed] == [12]

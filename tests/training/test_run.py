@@ -301,6 +301,14 @@ def test_only_the_last_two_checkpoints_and_the_best_are_kept(capture: Path, tmp_
     assert sorted(p.name for p in (tmp_path / "run" / "checkpoints").iterdir()) == ["00000050", "00000060", "best"]
 
 
+def test_best_is_the_best_point_of_the_curve_also_when_that_is_the_last(unbroken: Path) -> None:
+    curve = read_metrics(unbroken / "metrics.json").curve
+    best = load_model(unbroken / "checkpoints" / "best")
+    assert best.iteration == max(curve, key=lambda point: point.psnr).iteration == ITERATIONS
+    for name, tensor in load_model(unbroken).scene.state_dict().items():
+        assert torch.equal(tensor, best.scene.state_dict()[name]), name
+
+
 def test_warmup_leaves_temporal_modules_untouched_and_the_joint_phase_moves_them(capture: Path, tmp_path: Path) -> None:
     run = TrainingRun.create(capture, tmp_path / "run", _config())
     trainer = run._trainer

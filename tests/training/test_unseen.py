@@ -68,6 +68,10 @@ def test_a_run_ends_without_them_and_says_so(micro: Path, tmp_path: Path) -> Non
     assert not [event for event in read_metrics(kept.metrics_path).events if event.kind == "unseen"]
     assert open_model(run.folder).scene.scaffold.count == run.trainer.scene.scaffold.count
     assert metrics.curve[-1].anchors == run.trainer.scene.scaffold.count
+    views = [(frame.camera.center, frame.time) for frame in run.capture.train]
+    drawn = len(run.trainer.scene.compose_together(views)[0].children)
+    assert 0 < metrics.gaussians == metrics.curve[-1].gaussians == reports[-1].gaussians <= drawn
+    assert drawn < kept.log.gaussians
 
 
 @pytest.mark.parametrize("pixels", [0.0, 0.5])

@@ -10,12 +10,13 @@ from statistics import mean
 import numpy as np
 import pytest
 
-from graings.capture.capture import PointCloud
+from graings.capture.capture import Capture, PointCloud
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import Array, Body, SyntheticScene, write_synthetic
 from graings.config import TrainConfig, make_config
 from graings.random import RandomStreams
+from graings.training.density.budget import affordable_anchors
 from graings.training.initialization.initial_scene import initial_points
 from graings.training.initialization.visual_hull import MIN_COVERAGE, MIN_POINTS, coverage, masked, visual_hull
 from tests.capture.captures import without_alpha, write_image
@@ -54,8 +55,9 @@ def _ball(home: Array, swing: Array, radius: float) -> Body:
 
 
 def _draft(**options: object) -> TrainConfig:
-    """A draft that begins with every point that the images allow."""
-    return make_config("draft", {"init.points": 60_000, "init.max_points": 60_000, **options})
+    """A draft that begins with every point that the images allow, whatever memory that takes."""
+    every = {"init.points": 60_000, "init.max_points": 60_000, "density.memory_mb": 100_000}
+    return make_config("draft", {**every, **options})
 
 
 def _found(capture: Path, config: TrainConfig) -> tuple[int, float]:
@@ -88,6 +90,49 @@ def test_the_number_of_initial_anchors_is_limited(large_motion: Path) -> None:
         tight = _draft(**{"density.max_anchors": 100})
         most = initial_points(capture, ImageStore(WHITE), tight, RandomStreams(0)).positions
         assert len(most) == (100 if capture is cloud else every)
+
+
+def _small_ball(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Capture:
+    """A ball at rest, of which 20 000 random points hit next to nothing."""
+    ball = _ball(np.array([0.6, 0.0, 0.3]), np.zeros(3), 0.1)
+    monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((ball,))))
+    return load_capture(write_synthetic(folder, frames=16, size=64))
+
+
+def test_of_a_small_object_there_are_points_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = _small_ball(tmp_path / "small", monkeypatch)
+    config = _draft(**{"init.points": 20_000})
+    first = initial_points(data, ImageStore(WHITE), config, RandomStreams(0))
+    assert MIN_POINTS < len(first.positions) < 20_000
+    assert (first.time_window, first.notes) == (1.0, ())
+    away = np.linalg.norm(data.units.points_back(first.positions) - np.array([0.6, 0.0, 0.3]), axis=1)
+    assert float(np.quantile(away, 0.9)) < 0.25
+
+
+def test_cameras_that_do_not_fit_the_masks_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = _small_ball(tmp_path / "small", monkeypatch)
+    cameras = [frame.camera for frame in data.train]
+    turned = [replace(frame, camera=cameras[(3 * k + 5) % len(cameras)]) for k, frame in enumerate(data.train)]
+    first = initial_points(
+        replace(data, train=tuple(turned)), ImageStore(WHITE), _draft(**{"init.points": 5_000}), RandomStreams(0)
+    )
+    assert len(first.positions) == 5_000
+    (note,) = first.notes
+    assert (note.source, note.triangulated) == ("random", None)
+    assert note.within_masks is not None
+    assert note.within_masks < MIN_POINTS
+    assert f"only {note.within_masks} of those in view" in note.message
+    assert "check the cameras, or raise init.points" in note.message
+
+
+def test_first_anchors_fit_into_the_memory_wherever_they_come_from(large_motion: Path) -> None:
+    data = load_capture(large_motion)
+    cloud = replace(data, points=PointCloud(_grid(), np.zeros_like(_grid(), np.float32)))
+    for capture, options in ((data, {}), (cloud, {}), (data, {"init.min_mask_fraction": 0.0})):
+        config = _draft(**{"init.points": 20_000, "density.memory_mb": 4, **options})
+        affordable = affordable_anchors(config.scene, config.batch, 4)
+        assert affordable < config.density.max_anchors
+        assert len(initial_points(capture, ImageStore(WHITE), config, RandomStreams(0)).positions) == affordable
 
 
 def test_a_clip_with_small_motion_begins_as_a_whole(tmp_path: Path) -> None:

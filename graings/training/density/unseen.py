@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from graings.capture.capture import Frame
+from graings.evaluation.evaluate import subset
 from graings.render import contributions
 from graings.report.events import Event, Unseen
 from graings.scene.prepared import PreparedScene
@@ -24,7 +25,8 @@ from graings.training.training_log import TrainingLog
 def drop_unseen(trainer: Trainer, log: TrainingLog) -> tuple[Event, ...]:
     """Remove every anchor whose children each contribute less than `density.unseen_pixels` to each training view.
 
-    A scene of which nothing is seen stays as it is. Returns what happened.
+    A scene of which nothing is seen stays as it is. Where anchors go, the log's number of Gaussians becomes that of as
+    many training views as a step has, spread evenly. Returns what happened.
     """
     least = log.config.density.unseen_pixels
     if least == 0:
@@ -34,7 +36,14 @@ def drop_unseen(trainer: Trainer, log: TrainingLog) -> tuple[Event, ...]:
         removed = int((~keep).sum())
         if 0 < removed < len(keep):
             trainer.keep_anchors(keep)
+            log.gaussians = drawn_in_any(trainer.scene, subset(log.capture.train, log.config.batch))
     return (Unseen(iteration=trainer.run_iteration, anchors=removed),) if 0 < removed < len(keep) else ()
+
+
+@torch.no_grad()
+def drawn_in_any(scene: Scene, frames: Sequence[Frame]) -> int:
+    """How many children are drawn in any of these views."""
+    return len(scene.compose_together([(frame.camera.center, frame.time) for frame in frames])[0].children)
 
 
 def largest_contributions(scene: Scene, frames: Sequence[Frame]) -> Float[Tensor, " anchor"]:

@@ -24,8 +24,9 @@ from graings.report.start_events import PointsInitialized
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.training.curriculum.time_window import TimeWindow
-from graings.training.density.budget import most_anchors
+from graings.training.density.budget import affordable_anchors, most_anchors
 from graings.training.density.growth import voxel_keys
+from graings.training.initialization.neighbours import neighbour_distance
 from graings.training.initialization.triangulation import triangulate
 from graings.training.initialization.visual_hull import (
     MIN_COVERAGE,
@@ -52,8 +53,6 @@ CARVING_VIEWS = 60
 # Masks that cover more than this share of the pixels do not constrain positions. Objects on a background cover a third
 # at most (bouncingballs), a room nearly everything.
 FILLED = 0.7
-
-NEIGHBOURS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,8 +124,9 @@ def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, st
 
     The time window is as configured, or else the widest in which the points still cover the masks.
     """
-    generator = streams["init.points"]
-    window, most = config.time_window or 1.0, config.init.max_points
+    generator, window = streams["init.points"], config.time_window or 1.0
+    affordable = affordable_anchors(config.scene, config.batch, config.density.memory_mb)
+    most = min(config.init.max_points, affordable)
     # Points on surfaces stay: more than the anchor budget would leave no room for growth. Points of a visual hull lie
     # inside of objects, and most of them are soon pruned.
     surface_limit = min(most, most_anchors(config))
@@ -147,8 +147,24 @@ def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, st
         notes = (note,)
         if places is not None:
             return InitialPoints(_subsampled(places, surface_limit, generator), window, notes)
-    inside, window = _within_hull(cube, order, whole, capture, images, config) or (cube, window)
+    spacing = 2 * half / len(cube) ** (1 / 3)
+    found = _within_hull(cube, spacing, half, order, whole, capture, images, config)
+    if found is None:
+        few = visual_hull(cube, whole, config.init.min_mask_fraction, _cells(half, spacing))
+        if len(few):  # of a small object: look closer
+            low, high = few.min(0) - spacing, few.max(0) + spacing
+            cube_of_few = low + (high - low) * torch.rand(cube.shape, generator=generator, dtype=torch.float64).numpy()
+            closer = float(np.prod(high - low) / len(cube)) ** (1 / 3)
+            found = _within_hull(cube_of_few, closer, half, order, whole, capture, images, config)
+        if found is None:
+            notes = (*notes, PointsInitialized(iteration=0, source="random", within_masks=len(few)))
+    inside, window = found or (cube, window)
     return InitialPoints(_subsampled(inside, most, generator), window, notes)
+
+
+def _cells(half: float, spacing: float) -> int:
+    """Cells of the longer image side, each a little smaller than the projected `spacing` of points."""
+    return math.ceil(1.25 * 2 * half / spacing)
 
 
 def _triangulated(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, PointsInitialized]:
@@ -181,25 +197,27 @@ def _subsampled(points: NDArray[np.float64], most: int, generator: torch.Generat
 
 
 def _within_hull(
-    cube: NDArray[np.float64],
+    points: NDArray[np.float64],
+    spacing: float,
+    half: float,
     order: Sequence[int],
     whole: Sequence[MaskedFrame],
     capture: Capture,
     images: ImageStore,
     config: TrainConfig,
 ) -> tuple[NDArray[np.float64], float] | None:
-    """The points of `cube` within the visual hull, and the share of the clip it is made of; None where none are left.
+    """Those of `points` within the visual hull, and the share of the clip it is made of; None where too few are left.
 
-    `whole` are the masks of views of the whole clip; for a part of it the first views in `order` are used.
+    `spacing` is that of the points, `half` half the size of what the views see. `whole` are the masks of views of the
+    whole clip; for a part of it the first views in `order` are used.
     """
-    # A cell of an image is a little smaller than the projected spacing of the points.
-    cells = math.ceil(1.25 * len(cube) ** (1 / 3))
+    cells = _cells(half, spacing)
     best, most = None, -1.0
     for share in WINDOW_FRACTIONS if config.time_window is None else [config.time_window]:
         views = whole if share == 1 else _masked_views(capture, images, config, order, share)
         if config.time_window is None and share < 1 and len(views) < MIN_VIEWS:
             break
-        kept = visual_hull(cube, views, config.init.min_mask_fraction, cells)
+        kept = visual_hull(points, views, config.init.min_mask_fraction, cells)
         if len(kept) < MIN_POINTS:
             continue
         covered = coverage(kept, views, cells)
@@ -222,19 +240,3 @@ def content_half_size(capture: Capture) -> float:
         for frame in capture.train
     ]
     return max(float(np.median(half)), 1e-3)
-
-
-def neighbour_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Root mean squared distance to the three nearest neighbours, [M]; 1 for a single point."""
-    count = len(points)
-    if count < 2:
-        return np.ones(count)
-    k = min(NEIGHBOURS, count - 1)
-    tensor = torch.from_numpy(points)
-    result = np.empty(count)
-    chunk = max(1, 20_000_000 // count)
-    for start in range(0, count, chunk):
-        distances = torch.cdist(tensor[start : start + chunk], tensor, compute_mode="donot_use_mm_for_euclid_dist")
-        nearest = distances.topk(k + 1, dim=-1, largest=False).values[:, 1:]
-        result[start : start + chunk] = nearest.square().mean(-1).sqrt().numpy()
-    return result
