@@ -1,15 +1,25 @@
 // Facts: the numbers of one job, its files, and what can be done with it.
 
+import { attempt } from "./failure.js";
 import { count, element, span } from "./format.js";
 import { may, request } from "./requests.js";
+import { Rows } from "./rows.js";
 import { ask, showTasks } from "./tasks.js";
 
 const $ = (id) => document.getElementById(id);
 const FILES = { model: "model", metrics: "metrics.json", report: "report", log: "log" };
+const files = new Rows($("files"), () => {
+  const node = element("a");
+  const show = ({ id, address }) => {
+    node.href = address;
+    node.textContent = FILES[id];
+  };
+  return { node, show };
+});
 
 /**
  * @param {any} job resource; none: show nothing
- * @param {{changed: () => Promise<void>, removed: () => void, failed: (error: Error) => void}} then
+ * @param {{changed: () => Promise<void>, removed: () => void}} then
  */
 export function showFacts(job, then) {
   $("facts").hidden = !job;
@@ -37,9 +47,8 @@ export function showFacts(job, then) {
   $("numbers").replaceChildren(...rows.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]));
   showActions(job, then);
   showCurve(job, report);
-  $("files").replaceChildren(
-    ...Object.entries(FILES).filter(([key]) => job.links[key] && may("read")).map(([key, text]) => element("a", { href: job.links[key] }, text)),
-  );
+  const made = Object.keys(FILES).filter((key) => job.links[key] && may("read"));
+  files.show(made.map((key) => ({ id: key, address: job.links[key] })));
 }
 
 const eventText = (event) => event.message ?? event;
@@ -53,13 +62,11 @@ function showActions(job, then) {
     const made = element("button", { type: "button", class: "quiet" }, verb[0].toUpperCase() + verb.slice(1));
     made.onclick = async () => {
       made.disabled = true;
-      try {
+      await attempt(async () => {
         await run();
         $("actions").dataset.shown = "";
         await then.changed();
-      } catch (error) {
-        then.failed(error);
-      }
+      });
       made.disabled = false;
     };
     return made;

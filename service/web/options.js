@@ -3,6 +3,7 @@
 
 import { element } from "./format.js";
 
+const PRESET = "standard"; // the service's default, chosen again whenever the form is reset
 // The ones that most people change; all others are folded.
 const COMMON = ["iterations", "capture.max_side", "capture.background", "capture.test_every", "density.max_anchors", "seed"];
 
@@ -29,8 +30,7 @@ export class OptionsForm {
   /** @param {{schema: any, presets: Object<string, any>}} all as /options gives them */
   fill({ schema, presets }) {
     this.presets = presets;
-    this.preset.replaceChildren(...Object.keys(presets).map((name) => element("option", {}, name)));
-    this.preset.value = "standard";
+    this.preset.replaceChildren(...Object.keys(presets).map((name) => element("option", name === PRESET ? { selected: "" } : {}, name)));
     for (const [name, described] of leaves(schema, schema)) {
       if (name === "preset") continue;
       const input = control(described);

@@ -2,7 +2,8 @@
 // interface of the same server.
 
 import { showFacts } from "./facts.js";
-import { ago, count, element, span } from "./format.js";
+import { attempt, showFailure } from "./failure.js";
+import { JobList } from "./job_list.js";
 import { may, request, session, signIn, signOut } from "./requests.js";
 import { Stage } from "./stage.js";
 import { uploadForm } from "./upload.js";
@@ -14,24 +15,32 @@ const jobs = new Map(); // job resources by id
 let pages = 1;
 let current = null; // id of the job in the middle
 let stream = null;
-let stage = null;
+let stage = null; // none while the page asks for a key
+const rows = new JobList($("jobs"), (id) => attempt(() => choose(id)));
 
 // ---- the session, if the service needs a key
 
-async function start() {
+/** The secret of a link, if the address has one. The address bar, where others could read it, loses it. */
+function takeSecret() {
   const link = location.hash.match(/^#link=(.+)$/);
+  if (link) history.replaceState(null, "", location.pathname);
+  return link?.[1];
+}
+
+async function start() {
+  const secret = takeSecret();
   try {
-    if (link) return await signIn(link[1]);
+    if (secret) return await signIn(secret);
     Object.assign(session, await request("/session"));
   } catch (error) {
     document.querySelector("main").hidden = true;
     $("signin").hidden = false;
-    if (link) $("signin").querySelector("[role=alert]").textContent = error.message;
+    if (secret) showFailure(error);
     return;
   }
   stage = new Stage($("player"));
   $("upload").hidden = !may("train");
-  if (may("train")) uploadForm((id) => list().then(() => choose(id), showError));
+  if (may("train")) uploadForm((id) => attempt(() => list().then(() => choose(id))));
   document.body.classList.toggle("guest", !may("read"));
   $("signout").hidden = session.name === null;
   $("signout").textContent = `Sign out ${session.name}`;
@@ -40,11 +49,9 @@ async function start() {
 
 $("signin").onsubmit = (event) => {
   event.preventDefault();
-  signIn(event.target.elements.key.value.trim()).catch((error) => {
-    event.target.querySelector("[role=alert]").textContent = error.message;
-  });
+  attempt(() => signIn(event.target.elements.key.value.trim()));
 };
-$("signout").onclick = () => signOut().catch(showError);
+$("signout").onclick = () => attempt(signOut);
 
 // ---- jobs
 
@@ -77,41 +84,7 @@ async function list() {
 /** Id of the job that the address names. */
 const linked = () => new URLSearchParams(location.hash.slice(1)).get("job");
 
-function showJobs() {
-  const rows = [...jobs.values()].map((job) => {
-    const button = element("button", { type: "button", "aria-current": String(job.id === current) });
-    const top = element("span", { class: "top" });
-    top.append(element("span", { class: "title" }, job.name), element("span", { class: `state ${job.state}` }, job.state));
-    button.append(top);
-    const report = job.progress;
-    if (report && (job.state === "running" || job.state === "cancelled")) {
-      button.append(element("progress", { max: report.iterations, value: report.iteration, "aria-label": "Progress" }));
-    }
-    button.append(element("span", { class: "sub" }, summary(job)));
-    button.onclick = () => choose(job.id);
-    const row = element("li");
-    row.append(button);
-    return row;
-  });
-  const focused = [...$("jobs").querySelectorAll("button")].indexOf(document.activeElement);
-  $("jobs").replaceChildren(...rows);
-  if (focused >= 0) $("jobs").querySelectorAll("button")[focused]?.focus();
-}
-
-function summary(job) {
-  const report = job.progress;
-  if (job.state === "queued") return report ? `waiting, continues from ${count(job.checkpoint || 0)}` : "waiting for a worker";
-  if (!report) return job.state === "running" ? "starting" : ago(job.created_at);
-  const done = `${count(report.iteration)} of ${count(report.iterations)}`;
-  if (job.state !== "running") return `${done} · ${ago(job.finished_at || job.created_at)}`;
-  if (report.step === "drawing") return `drawing the images: ${count(report.step_done)} of ${count(report.step_total)}`;
-  if (report.phase === "capture") {
-    const parts = report.step_total > 1 ? ` ${count(report.step_done)} of ${count(report.step_total)}` : "";
-    return `finding the cameras: ${report.step}${parts}`;
-  }
-  if (report.phase === "loading") return "loading the capture";
-  return report.eta_s == null ? done : `${done} · ${span(report.eta_s)} left`;
-}
+const showJobs = () => rows.show([...jobs.values()], current);
 
 function choose(id) {
   const changed = current !== id;
@@ -132,10 +105,9 @@ function show(job) {
       stream?.close();
       current = null;
     },
-    failed: showError,
   });
   const state = job && linked() === job.id ? location.hash.slice(1) : "";
-  stage.show(job, state).catch(showError);
+  stage.show(job, state);
 }
 
 function follow(id) {
@@ -153,7 +125,7 @@ function follow(id) {
     update({ ...job, progress: JSON.parse(event.data) });
     if (Date.now() - refreshed > LIST_EVERY_MS) {
       refreshed = Date.now();
-      request(`/jobs/${id}`).then((fresh) => current === id && update({ ...fresh, progress: jobs.get(id).progress }), showError);
+      request(`/jobs/${id}`).then((fresh) => current === id && update({ ...fresh, progress: jobs.get(id).progress }), showHealth);
     }
   });
   stream.addEventListener("state", (event) => update(JSON.parse(event.data)));
@@ -164,33 +136,32 @@ function follow(id) {
 }
 
 window.addEventListener("hashchange", () => {
+  const secret = takeSecret();
+  if (secret) return attempt(() => signIn(secret));
+  if (!stage) return;
   const id = linked();
   if (id && id !== current && jobs.has(id)) choose(id);
   else if (id === current) stage.player.state = location.hash.slice(1);
 });
 
-function showError(error) {
-  $("health").textContent = error.message;
-}
+// ---- what is read again and again
+
+const showHealth = ({ message }) => ($("health").textContent = message);
 
 async function health() {
   const readiness = await request("/readyz");
   const workers = readiness.workers === 1 ? "1 worker" : `${readiness.workers} workers`;
-  $("health").textContent = readiness.workers ? workers : "No worker: jobs wait. Start one with: graings worker";
+  return { message: readiness.workers ? workers : "No worker: jobs wait. Start one with: graings worker" };
 }
 
 async function refresh() {
-  try {
-    await health();
-    await list();
-  } catch (error) {
-    showError(error);
-  }
+  const [healthy, listed] = await Promise.allSettled([health(), list()]); // a full disk must not hide what can be deleted
+  showHealth(healthy.reason ?? listed.reason ?? healthy.value);
   setTimeout(refresh, LIST_EVERY_MS);
 }
 
 $("more").onclick = () => {
   pages += 1;
-  list().catch(showError);
+  attempt(list);
 };
 start();

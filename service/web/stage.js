@@ -5,15 +5,18 @@ import { Renderer } from "/web/player/renderer.js";
 import { Comparison } from "./comparison.js";
 import { may, request } from "./requests.js";
 
-const RELOAD_MS = 20_000; // while a job trains: the service needs seconds of a core for each scene file
+// While a job trains, or after a scene could not be loaded: the service needs seconds of a core for each scene file.
+const RELOAD_MS = 20_000;
 
 export class Stage {
   /** @param {HTMLElement} root */
   constructor(root) {
     this.job = null;
+    this.opened = false; // whether the cameras of the job are known or being asked for
     this.shown = null; // address of the scene that is loaded or being loaded
     this.loaded = 0;
     this.loading = false;
+    this.failed = false; // whether the last scene could not be loaded
     this.player = new Player(root, {
       worker: "/web/player/sort_worker.js",
       link: (state) => `${location.origin}/#job=${this.job.id}&${state}`,
@@ -33,6 +36,7 @@ export class Stage {
     const before = this.job;
     this.job = job;
     if (other || !job) {
+      this.opened = this.failed = false;
       this.shown = null;
       this.player.clear(job ? "" : "No model yet. Upload a capture, try a scene, or run graings demo.");
       this.comparison.show(null);
@@ -44,22 +48,37 @@ export class Stage {
       this.player.say(waits ? "The first checkpoint is not written yet." : "This job ended before its first checkpoint.");
       return;
     }
-    if (!this.shown) {
-      this.shown = address;
-      const facts = await request(job.links.views);
-      if (this.job?.id !== job.id) return;
-      this.player.say("");
-      this.player.open(facts, job.links.render);
-      if (state) this.player.state = state;
-      this.load(address);
-      this.compare(facts);
-    } else if (address !== this.shown && !this.loading && (job.state !== "running" || Date.now() - this.loaded > RELOAD_MS)) {
+    const seldom = job.state === "running" || this.failed;
+    if (!this.opened) {
+      await this.open(job, address, state);
+    } else if (address !== this.shown && !this.loading && (!seldom || Date.now() - this.loaded > RELOAD_MS)) {
       this.load(address);
     }
     if (before && before.checkpoint !== job.checkpoint) {
       this.comparison.refresh();
       if (!this.drawing) this.player.change();
     }
+  }
+
+  async open(job, address, state) {
+    this.opened = true;
+    this.shown = address;
+    let facts;
+    try {
+      facts = await request(job.links.views);
+    } catch (error) {
+      if (this.job?.id !== job.id) return;
+      this.opened = false; // the next refresh of the page asks again
+      this.shown = null;
+      this.player.say(error.message);
+      return;
+    }
+    if (this.job?.id !== job.id) return;
+    this.player.say("");
+    this.player.open(facts, job.links.render);
+    if (state) this.player.state = state;
+    this.load(address);
+    this.compare(facts);
   }
 
   compare(facts) {
@@ -77,12 +96,12 @@ export class Stage {
     }
     const { job } = this;
     this.loading = true;
-    try {
-      await this.player.load(address);
-    } catch (error) {
-      if (this.job?.id === job.id) this.player.say(error.message);
-    }
+    const error = await this.player.load(address).then(() => null, (refused) => refused);
     this.loading = false;
     this.loaded = Date.now();
+    if (this.job?.id !== job.id) return;
+    if (error || this.failed) this.player.say(error?.message ?? "");
+    this.failed = error !== null;
+    if (error) this.shown = null; // it is asked for again
   }
 }

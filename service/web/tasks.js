@@ -1,13 +1,17 @@
 // Tasks: the evaluations and videos of one job: ask for them, watch them, and show their results.
 
+import { attempt } from "./failure.js";
 import { element } from "./format.js";
 import { may, request } from "./requests.js";
+import { Rows } from "./rows.js";
 
 const $ = (id) => document.getElementById(id);
 const POLL_MS = 1000;
 
 let shown = null; // address of the job's tasks
 let timer = 0;
+let looks = 0; // an earlier look that ends later shows nothing
+const rows = new Rows($("tasks"), row);
 
 /**
  * Shows the tasks of a job, and looks again while one of them has not ended.
@@ -17,9 +21,8 @@ export function showTasks(job) {
   const address = may("read") ? job?.links.tasks : undefined;
   if (address === shown) return;
   shown = address;
-  clearTimeout(timer);
-  $("tasks").replaceChildren();
-  if (address) look(address);
+  rows.show([]);
+  look();
 }
 
 /**
@@ -30,39 +33,65 @@ export function showTasks(job) {
 export async function ask(address, body) {
   const json = { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
   await request(address, { method: "POST", ...(body ? json : {}) });
-  clearTimeout(timer);
-  await look(shown);
+  await look();
 }
 
-async function look(address) {
+/** Shows what the tasks are now, and looks again soon while one of them has not ended. */
+async function look() {
+  const number = ++looks;
+  clearTimeout(timer);
+  if (!shown) return;
   try {
-    const { tasks } = await request(address);
-    if (address !== shown) return;
-    const lines = await Promise.all(tasks.map(line));
-    if (address !== shown) return;
-    $("tasks").replaceChildren(...lines);
-    if (tasks.some(pending)) timer = setTimeout(() => look(address), POLL_MS);
+    const { tasks } = await request(shown);
+    const items = await Promise.all(tasks.map(async (task) => ({ ...task, text: await text(task) })));
+    if (number !== looks) return;
+    rows.show(items);
+    if (tasks.some(pending)) timer = setTimeout(look, POLL_MS);
   } catch {
-    timer = setTimeout(() => look(address), 5 * POLL_MS); // the service restarts; the page's health line says so
+    if (number === looks) timer = setTimeout(look, 5 * POLL_MS); // the service restarts; the page's health line says so
   }
 }
 
-async function line(task) {
-  const item = element("li", {}, await text(task));
-  if (task.links.video) item.append(element("a", { href: task.links.video }, "download"));
-  return item;
+/** A line with what became of a task, its video, and a button that stops or deletes it. */
+function row() {
+  const node = element("li");
+  const said = element("span");
+  const video = element("a", {}, "download");
+  const remove = element("button", { type: "button", class: "quiet" });
+  remove.hidden = !may("train");
+  node.append(said, remove);
+  const show = (task) => {
+    said.textContent = task.text;
+    if (task.links.video && !video.parentNode) said.after(video);
+    video.href = task.links.video ?? "";
+    remove.textContent = pending(task) ? "Stop" : "Delete";
+    remove.setAttribute("aria-label", `${remove.textContent} ${title(task)}`);
+    remove.onclick = () => attempt(() => stop(task, remove));
+  };
+  return { node, show };
+}
+
+async function stop(task, button) {
+  button.disabled = true;
+  try {
+    await request(task.links.self, { method: "DELETE" });
+  } finally {
+    button.disabled = false;
+  }
+  await look();
 }
 
 const pending = (task) => ["queued", "running"].includes(task.state);
 
+const title = ({ spec }) => (spec.kind === "video" ? `Video (${spec.format})` : `Evaluation of ${spec.split}`);
+
 async function text(task) {
-  const name = task.spec.kind === "video" ? `Video (${task.spec.format})` : `Evaluation of ${task.spec.split}`;
   if (task.links.metrics) {
     const { splits } = await request(task.links.metrics);
     const measured = splits[task.spec.split]?.psnr; // training a job for longer removes what its earlier model had
-    return `${name}: ${measured == null ? "of an earlier model" : `${measured.toFixed(2)} dB`} `;
+    return `${title(task)}: ${measured == null ? "of an earlier model" : `${measured.toFixed(2)} dB`}`;
   }
   const { done, total } = task.progress ?? {};
   const state = pending(task) && total ? `${done} of ${total} frames` : task.state;
-  return `${name}: ${task.error ?? state} `;
+  return `${title(task)}: ${task.error ?? state}`;
 }

@@ -13,12 +13,14 @@ export function uploadForm(submitted) {
   const form = $("upload");
   const options = new OptionsForm($("options"), form.elements.preset);
   let capture = null; // {name, body: Blob}
+  let sent = null; // the capture that is being sent
 
+  const allow = () => ($("train").disabled = !capture || sent !== null);
   const choose = (name, body) => {
     capture = name ? { name, body } : null;
     $("chosen").textContent = name || PROMPT;
-    $("train").disabled = !capture;
     $("refused").hidden = true;
+    allow();
   };
   const refuse = (text) => {
     $("refused").hidden = false;
@@ -62,37 +64,50 @@ export function uploadForm(submitted) {
   };
   form.onsubmit = (event) => {
     event.preventDefault();
-    if (!capture) return;
+    if ($("train").disabled) return;
+    sent = capture;
+    allow();
     const upload = new XMLHttpRequest(); // fetch does not report the progress of an upload
     upload.open("POST", `/jobs?${query({ name: capture.name.replace(/\.(zip|tar|tgz|tar\.gz)$/i, "") })}`);
     upload.setRequestHeader("Content-Type", "application/octet-stream");
     upload.responseType = "json";
     upload.upload.onprogress = (progress) => ($("sending").value = progress.loaded / progress.total);
     upload.onloadend = () => {
+      const another = capture !== sent; // chosen meanwhile, perhaps with options of its own
       $("sending").hidden = true;
+      sent = null;
+      allow();
       if (upload.status === 202) {
-        form.reset();
-        choose(null);
+        if (!another) {
+          form.reset();
+          choose(null);
+        }
         submitted(upload.response.id);
       } else {
         refuse(upload.response?.detail || "The service does not answer.");
       }
     };
     $("refused").hidden = true;
+    $("sending").value = 0;
     $("sending").hidden = false;
     upload.send(capture.body);
   };
-  const tryScene = (scene) => {
+  const tryScene = async (scene, button) => {
     $("refused").hidden = true;
-    request(`/jobs?${query({ scene })}`, { method: "POST" }).then((job) => {
+    button.disabled = true;
+    try {
+      const job = await request(`/jobs?${query({ scene })}`, { method: "POST" });
       $("examples").open = false;
       submitted(job.id);
-    }, (error) => refuse(error.message));
+    } catch (error) {
+      refuse(error.message);
+    }
+    button.disabled = false;
   };
   const offer = (scenes) => {
     const rows = scenes.map(({ name, question }) => {
       const button = element("button", { type: "button", class: "quiet" }, name);
-      button.onclick = () => tryScene(name);
+      button.onclick = () => tryScene(name, button);
       const row = element("li");
       row.append(button, element("span", {}, question));
       return row;
