@@ -14,7 +14,7 @@ import httpx2
 
 from client import calls
 from client.answers import ClientError, Event, RefusedError, RemoteJob
-from client.captures import Observe, packed, uploading
+from client.captures import Observe, Steps, packed, requesting, submitting, uploading
 from client.retry_limit import RetryLimit
 
 T = TypeVar("T")
@@ -51,9 +51,14 @@ class AsyncClient:
         `webhook` is an address that is told what happens; `webhook_secret` in the document of the answer verifies its
         messages.
         """
-        named = calls.job_name(name, capture)
-        upload_id = await self.upload(capture, observe)
-        return await self._do(calls.submit(upload_id, named, preset, config, priority, webhook, uuid.uuid4().hex))
+        named, key, how = calls.job_name(name, capture), uuid.uuid4().hex, calls.training(preset, config)
+
+        def request(upload_id: str) -> calls.Call[RemoteJob]:
+            return calls.submit(upload_id, named, preset, config, priority, webhook, key)
+
+        with ExitStack() as stack:
+            archive = await asyncio.to_thread(stack.enter_context, packed(capture))
+            return await self._steps(submitting(archive, observe, how, request))
 
     async def upload(self, capture: Path | str, observe: Observe | None = None) -> str:
         """Send a capture and return the id of its upload, of which a job can be made for a day.
@@ -62,26 +67,13 @@ class AsyncClient:
         """
         with ExitStack() as stack:
             archive = await asyncio.to_thread(stack.enter_context, packed(capture))
-            steps = uploading(archive, observe)
-            step = next(steps)
-            while True:
-                call, content, pause = step
-                await asyncio.sleep(pause)
-                try:
-                    answer = await self._do(call, content)
-                except ClientError as error:
-                    step = steps.throw(error)
-                    continue
-                try:
-                    step = steps.send(answer)
-                except StopIteration as end:
-                    return str(end.value)
+            return await self._steps(uploading(archive, observe))
 
     async def submit_scene(
         self, scene: str, *, preset: str = "standard", config: calls.Query | None = None
     ) -> RemoteJob:
         """Train on a synthetic scene, which the service draws itself: one of `scenes` in `GET /options`."""
-        return await self._do(calls.submit_scene(scene, preset, config, uuid.uuid4().hex))
+        return await self._steps(requesting(calls.submit_scene(scene, preset, config, uuid.uuid4().hex)))
 
     async def job(self, job_id: str) -> RemoteJob:
         return await self._do(calls.job(job_id))
@@ -187,6 +179,22 @@ class AsyncClient:
 
     async def readiness(self) -> dict[str, Any]:
         return await self._do(calls.readiness())
+
+    async def _steps(self, steps: Steps[T]) -> T:
+        """Send the requests of `steps`, and return what it makes of their answers."""
+        try:
+            call, content, pause = next(steps)
+            while True:
+                await asyncio.sleep(pause)
+                try:
+                    answer = await self._do(call, content)
+                except ClientError as error:
+                    call, content, pause = steps.throw(error)
+                else:
+                    call, content, pause = steps.send(answer)
+        except StopIteration as end:
+            result: T = end.value
+            return result
 
     async def _do(self, call: calls.Call[T], content: Iterator[bytes] | None = None) -> T:
         for attempt in range(calls.ATTEMPTS):

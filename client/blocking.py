@@ -13,7 +13,7 @@ import httpx2
 
 from client import calls
 from client.answers import ClientError, Event, RefusedError, RemoteJob
-from client.captures import Observe, packed, uploading
+from client.captures import Observe, Steps, packed, requesting, submitting, uploading
 from client.retry_limit import RetryLimit
 
 T = TypeVar("T")
@@ -54,9 +54,13 @@ class Client:
         `webhook` is an address that is told what happens; `webhook_secret` in the document of the answer verifies its
         messages.
         """
-        named = calls.job_name(name, capture)
-        upload_id = self.upload(capture, observe)
-        return self._do(calls.submit(upload_id, named, preset, config, priority, webhook, uuid.uuid4().hex))
+        named, key, how = calls.job_name(name, capture), uuid.uuid4().hex, calls.training(preset, config)
+
+        def request(upload_id: str) -> calls.Call[RemoteJob]:
+            return calls.submit(upload_id, named, preset, config, priority, webhook, key)
+
+        with packed(capture) as archive:
+            return self._steps(submitting(archive, observe, how, request))
 
     def upload(self, capture: Path | str, observe: Observe | None = None) -> str:
         """Send a capture and return the id of its upload, of which a job can be made for a day.
@@ -64,24 +68,11 @@ class Client:
         A connection that breaks, or a service that restarts, is continued where it broke.
         """
         with packed(capture) as archive:
-            steps = uploading(archive, observe)
-            step = next(steps)
-            while True:
-                call, content, pause = step
-                time.sleep(pause)
-                try:
-                    answer = self._do(call, content)
-                except ClientError as error:
-                    step = steps.throw(error)
-                    continue
-                try:
-                    step = steps.send(answer)
-                except StopIteration as end:
-                    return str(end.value)
+            return self._steps(uploading(archive, observe))
 
     def submit_scene(self, scene: str, *, preset: str = "standard", config: calls.Query | None = None) -> RemoteJob:
         """Train on a synthetic scene, which the service draws itself: one of `scenes` in `GET /options`."""
-        return self._do(calls.submit_scene(scene, preset, config, uuid.uuid4().hex))
+        return self._steps(requesting(calls.submit_scene(scene, preset, config, uuid.uuid4().hex)))
 
     def job(self, job_id: str) -> RemoteJob:
         return self._do(calls.job(job_id))
@@ -186,6 +177,22 @@ class Client:
 
     def readiness(self) -> dict[str, Any]:
         return self._do(calls.readiness())
+
+    def _steps(self, steps: Steps[T]) -> T:
+        """Send the requests of `steps`, and return what it makes of their answers."""
+        try:
+            call, content, pause = next(steps)
+            while True:
+                time.sleep(pause)
+                try:
+                    answer = self._do(call, content)
+                except ClientError as error:
+                    call, content, pause = steps.throw(error)
+                else:
+                    call, content, pause = steps.send(answer)
+        except StopIteration as end:
+            result: T = end.value
+            return result
 
     def _do(self, call: calls.Call[T], content: Iterator[bytes] | None = None) -> T:
         for attempt in range(calls.ATTEMPTS):

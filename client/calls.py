@@ -73,13 +73,7 @@ def no_events(url: httpx2.URL) -> str:
 def submit(
     upload_id: str, name: str, preset: str, config: Query | None, priority: int, webhook: str | None, key: str
 ) -> Call[RemoteJob]:
-    query = {
-        "capture": upload_id,
-        "name": name,
-        "preset": preset,
-        "priority": priority,
-        "config": json.dumps(dict(config or {})),
-    }
+    query = {"capture": upload_id, "name": name, "priority": priority, **training(preset, config)}
     query |= {} if webhook is None else {"webhook": webhook}
     return Call("POST", "/jobs", _job, query, {"Idempotency-Key": key})
 
@@ -89,8 +83,9 @@ def job_name(name: str | None, capture: Path | str) -> str:
     return (name or Path(capture).resolve().stem)[:NAME_LENGTH]
 
 
-def begin_upload(size: int) -> Call[dict[str, Any]]:
-    return Call("POST", "/uploads", _json, {"bytes": size})
+def begin_upload(size: int, how: Query | None = None) -> Call[dict[str, Any]]:
+    """`how` it will be trained on is `training`: a wrong preset or option is refused before anything is sent."""
+    return Call("POST", "/uploads", _json, {"bytes": size, **(how or {})})
 
 
 def send_part(upload_id: str, start: int, end: int, size: int) -> Call[dict[str, Any]]:
@@ -104,9 +99,17 @@ def upload_state(upload_id: str) -> Call[dict[str, Any]]:
     return Call("GET", f"/uploads/{upload_id}", _json)
 
 
+def delete_upload(upload_id: str) -> Call[None]:
+    return Call("DELETE", f"/uploads/{upload_id}", lambda response: None)
+
+
 def submit_scene(scene: str, preset: str, config: Query | None, key: str) -> Call[RemoteJob]:
-    query = {"scene": scene, "preset": preset, "config": json.dumps(dict(config or {}))}
-    return Call("POST", "/jobs", _job, query, {"Idempotency-Key": key})
+    return Call("POST", "/jobs", _job, {"scene": scene, **training(preset, config)}, {"Idempotency-Key": key})
+
+
+def training(preset: str, config: Query | None) -> Query:
+    """The parameters that say how to train."""
+    return {"preset": preset, "config": json.dumps(dict(config or {}))}
 
 
 def job(job_id: str) -> Call[RemoteJob]:

@@ -5,21 +5,26 @@ from __future__ import annotations
 import tempfile
 import zipfile
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from client import calls
-from client.answers import ClientError
+from client.answers import ClientError, RefusedError, RemoteJob
 from client.retry_limit import RetryLimit
+
+T = TypeVar("T")
 
 CHUNK = 1 << 20
 # Bytes of one request: a proxy may keep a body back until it is complete, and loses it when the connection breaks.
 PART = 16 << 20
 BROKEN_BODY = 400  # a proxy's or the service's answer to a connection that broke within a body
+UPLOAD_TAKEN = 404  # the service's answer for a moment, while an earlier request of the same key makes the job
 
 Observe = Callable[[int, int], None]
-Step = tuple[calls.Call[dict[str, Any]], Iterator[bytes] | None, float]
+# A request, its body and a pause before it. The answer is sent back, or a `ClientError` thrown in.
+Step = tuple[calls.Call[Any], Iterator[bytes] | None, float]
+Steps = Generator[Step, Any, T]
 
 
 @contextmanager
@@ -52,15 +57,14 @@ def chunks(archive: Path, observe: Observe | None, start: int, end: int) -> Iter
                 observe(file.tell(), total)
 
 
-def uploading(archive: Path, observe: Observe | None) -> Generator[Step, dict[str, Any], str]:
+def uploading(archive: Path, observe: Observe | None, how: calls.Query | None = None) -> Steps[str]:
     """The requests that bring an archive to the service, and at last the id of the upload.
 
-    Each step is a request with its body and a pause before it; the answer is sent back, or a `ClientError` thrown in.
-    After an interruption the service is asked how far it came, and the rest is sent, until nothing has arrived for
-    `RETRY_FOR_S` after the first failure.
+    `how` is that of `calls.begin_upload`. After an interruption the service is asked how far it came, and the rest is
+    sent, until nothing has arrived for `RETRY_FOR_S` after the first failure.
     """
     size = archive.stat().st_size
-    state = yield calls.begin_upload(size), None, 0.0
+    state = yield calls.begin_upload(size, how), None, 0.0
     received, broken, limit = 0, False, RetryLimit(BROKEN_BODY)
     while broken or received < size:
         end, asked = min(size, received + PART), broken
@@ -81,3 +85,33 @@ def uploading(archive: Path, observe: Observe | None) -> Generator[Step, dict[st
             limit.check()
     upload_id: str = state["id"]
     return upload_id
+
+
+def requesting(call: calls.Call[RemoteJob]) -> Steps[RemoteJob]:
+    """The request for a job, until it is answered; all have its key, so that they make one job."""
+    limit, pause = RetryLimit(UPLOAD_TAKEN), 0.0
+    while True:
+        try:
+            job: RemoteJob = yield call, None, pause
+        except ClientError as error:
+            limit.failed(error)
+            limit.check()
+            pause = calls.RECONNECT_S
+        else:
+            return job
+
+
+def submitting(
+    archive: Path, observe: Observe | None, how: calls.Query, request: Callable[[str], calls.Call[RemoteJob]]
+) -> Steps[RemoteJob]:
+    """The requests that bring an archive to the service and make a job of it; `request` gets the id of the upload.
+
+    Where the job is refused, the upload is deleted.
+    """
+    upload_id = yield from uploading(archive, observe, how)
+    try:
+        return (yield from requesting(request(upload_id)))
+    except RefusedError:
+        with suppress(ClientError):  # the caller must hear of the refusal
+            yield calls.delete_upload(upload_id), None, 0.0
+        raise

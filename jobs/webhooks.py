@@ -6,6 +6,7 @@ inside a private network are refused, as the worker may reach there what the sub
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import socket
@@ -48,15 +49,26 @@ def deliver(url: str, secret: str, message_id: str, content: dict[str, Any]) -> 
             "webhook-timestamp": str(int(now.timestamp())),
             "webhook-signature": Webhook(secret).sign(message_id, now, body),
         }
-        with httpx2.Client(timeout=TIMEOUT_S, trust_env=False) as client:
-            request = client.build_request("POST", pinned, content=body, headers=headers)
-            request.extensions["sni_hostname"] = target.host
-            response = client.send(request, stream=True)  # whatever the receiver sends is not read
-            response.close()
+        status = asyncio.run(_status(pinned, target.host, headers, body))
+    except TimeoutError as error:
+        raise WebhookError(f"{url}: did not answer within {TIMEOUT_S:g} s") from error
     except (httpx2.HTTPError, httpx2.InvalidURL, OSError, ValueError) as error:
         raise WebhookError(f"{url}: {error or type(error).__name__}") from error
-    if not response.is_success:
-        raise WebhookError(f"{url}: answered {response.status_code}")
+    if not 200 <= status < 300:
+        raise WebhookError(f"{url}: answered {status}")
+
+
+async def _status(url: httpx2.URL, server: str, headers: dict[str, str], body: str) -> int:
+    """The status that `server` answers with; what follows it is not read. Raises `TimeoutError`.
+
+    There is one deadline for all: a timeout of the client's begins again with each byte that the receiver sends.
+    """
+    async with asyncio.timeout(TIMEOUT_S), httpx2.AsyncClient(timeout=None, trust_env=False) as client:
+        request = client.build_request("POST", url, content=body, headers=headers)
+        request.extensions["sni_hostname"] = server
+        response = await client.send(request, stream=True)
+        await response.aclose()
+        return response.status_code
 
 
 def _address(target: httpx2.URL) -> str:

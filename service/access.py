@@ -1,8 +1,9 @@
 """Access: which caller may send which request. Every route but the open ones depends on `authorize`.
 
 A caller shows a key in `Authorization: Bearer`, or a browser the session it was given for one. Reading needs the scope
-`read` and everything else `train`, except for the operations in `NEEDS`. A job belongs to the key that made it: to
-others it does not exist. Without any key, a service that only this machine can reach lets everybody do everything.
+`read` and everything else `train`, except for the operations in `NEEDS`. A job belongs to the key that made it: who has
+another key does not see it, unless that was made from this one. Without any key, a service that only this machine can
+reach lets everybody do everything.
 
 Dependencies are coroutines here and elsewhere: FastAPI gives every other function a thread, and each of them waits for
 a core and for the interpreter.
@@ -23,6 +24,7 @@ from jobs.job import JobNotFound, JobSpec
 from service.context import Context, ContextDep
 from service.keys import Key, Scope
 from service.problems import Forbidden, Unauthorized
+from service.request_limits import Kind
 from service.same_origin import SAFE_METHODS
 
 COOKIE: Final = "graings_session"
@@ -63,6 +65,11 @@ class Caller:
             return job_id == self.key.job
         return self.owns(spec.owner)
 
+    @property
+    def may_change(self) -> bool:
+        """Whether the caller may do more than look at its jobs."""
+        return self.scope.includes(Scope.TRAIN)
+
     def owns(self, owner: str | None) -> bool:
         """Whether what the key `owner` made is the caller's."""
         return self.key is None or self.scope is Scope.ADMIN or owner == self.owner
@@ -88,13 +95,9 @@ async def authorize(
     if caller.key is None:
         yield
         return
-    # All sessions of a key together, and a link apart from its key.
-    name = caller.key.parent if caller.key.parent and caller.key.kind == "session" else caller.key.id
-    context.request_limits.begin(name)
-    try:
+    kind: Kind = "event streams" if _operation(request) == "get_events" else "requests"
+    with context.request_limits.counted(caller.key.counted_as, kind):
         yield
-    finally:
-        context.request_limits.end(name)
 
 
 def _permitted(
@@ -116,9 +119,14 @@ def _permitted(
 
 
 def _needed(request: Request) -> Scope:
+    return NEEDS.get(_operation(request), Scope.READ if request.method in SAFE_METHODS else Scope.TRAIN)
+
+
+def _operation(request: Request) -> str:
+    """The name of the operation that the request asks for; empty for a route that has none."""
     route = request.scope.get("route")
     name = route.operation_id if isinstance(route, APIRoute) else None
-    return NEEDS.get(name or "", Scope.READ if request.method in SAFE_METHODS else Scope.TRAIN)
+    return name or ""
 
 
 async def _caller_of(request: Request) -> Caller:

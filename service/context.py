@@ -16,6 +16,7 @@ from jobs.store import Store
 from jobs.task_list import TaskList
 from service.archives import Limits
 from service.keys import Keys
+from service.pixel_limit import PixelLimit
 from service.rendering import ModelCache, RenderPool
 from service.request_limits import RequestLimits
 from service.resumable import ResumableUploads
@@ -41,6 +42,7 @@ class Context:
     keys: Keys
     resumable: ResumableUploads
     request_limits: RequestLimits
+    pixel_limit: PixelLimit
 
     @property
     def limits(self) -> Limits:
@@ -81,7 +83,8 @@ def open_context(settings: Settings) -> Context:
         scenes=SceneFiles(),
         keys=Keys(store.root / "keys"),
         resumable=ResumableUploads(store.root / "resumable"),
-        request_limits=RequestLimits(settings.key_requests, settings.key_open_requests),
+        request_limits=RequestLimits(settings.key_requests, settings.key_open_requests, settings.key_open_streams),
+        pixel_limit=PixelLimit(),
     )
 
 

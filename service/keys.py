@@ -23,6 +23,7 @@ from typing import Literal
 from graings.storage.files import write_json
 
 SESSION_S = 30 * 86_400.0
+DISCARD_EVERY_S = 3_600.0
 TOUCH_S = 60.0  # the time of the last use is exact to a minute, so that a request rarely writes
 
 _ID = re.compile(r"[ksl][0-9a-f]{12}")
@@ -30,7 +31,7 @@ _SECRET = re.compile(rf"graings_({_ID.pattern})_([A-Za-z0-9_-]{{43}})")
 
 
 class Scope(StrEnum):
-    """What a key allows: to look at one shared job (only links), to read and render its jobs, to change them, all."""
+    """What a key allows: to look at one job (only links), to read the jobs of another key, to make its own, all."""
 
     VIEW = "view"
     READ = "read"
@@ -47,8 +48,8 @@ class Scope(StrEnum):
 class Key:
     """A stored key. Times are Unix seconds.
 
-    `parent` is what a session or link was made from, and `job` the only job that a link shows. A revoked key stays in
-    the list; sessions and links are removed.
+    `parent` is what a session or link was made from, or the key whose jobs a key of scope `read` shows, and `job` the
+    only job that a link shows. A revoked key stays in the list; sessions and links are removed.
     """
 
     id: str
@@ -67,12 +68,18 @@ class Key:
     def valid(self) -> bool:
         return self.revoked_at is None and (self.expires_at is None or time.time() < self.expires_at)
 
+    @property
+    def counted_as(self) -> str:
+        """Whose limits its requests count for: all sessions of a key together, and a link apart from its key."""
+        return self.parent if self.kind == "session" and self.parent else self.id
+
 
 class Keys:
     """The keys in a folder. Any number of processes may use it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        self._discard_at = 0.0  # time.monotonic()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
     def create(
@@ -98,7 +105,7 @@ class Keys:
         key = self.get(match[1]) if match else None
         # Compared also when there is no such key: the time must not tell which ids exist.
         equal = hmac.compare_digest(_digest(match[2] if match else secret), key.digest if key else _digest(""))
-        if key is None or not equal or not self._usable(key):
+        if key is None or not equal or not self.usable(key):
             return None
         if key.used_at is None or time.time() - key.used_at > TOUCH_S:
             self._file(key.id, "used").touch()
@@ -117,8 +124,8 @@ class Keys:
         return Key(**{**written, "scope": Scope(written["scope"]), "used_at": used_at})
 
     def root(self, key: Key) -> str | None:
-        """The id of the key from which a session or link was made, or its own; None if it was made without a key."""
-        if key.kind == "key":
+        """The id of the key to which the jobs belong that a key shows; None for what was made without a key."""
+        if key.kind == "key" and key.parent is None:
             return key.id
         above = self.get(key.parent or "")
         return None if above is None else self.root(above)
@@ -141,16 +148,21 @@ class Keys:
                 self._file(key.id, suffix).unlink(missing_ok=True)
 
     def discard_expired(self) -> None:
-        """Remove sessions and links that can no longer be used."""
+        """Remove sessions and links that can no longer be used; at most once an hour, as it reads every key."""
+        now = time.monotonic()
+        if now < self._discard_at:
+            return
+        self._discard_at = now + DISCARD_EVERY_S
         for key in self.all():
-            if key.kind != "key" and not self._usable(key):
+            if key.kind != "key" and not self.usable(key):
                 self.revoke(key)
 
-    def _usable(self, key: Key) -> bool:
+    def usable(self, key: Key) -> bool:
+        """Whether the key is valid, and all that it was made from."""
         if not key.valid:
             return False
         above = self.get(key.parent or "")
-        return key.parent is None or (above is not None and self._usable(above))
+        return key.parent is None or (above is not None and self.usable(above))
 
     def _file(self, key_id: str, suffix: str = "json") -> Path:
         return self._folder / f"{key_id}.{suffix}"

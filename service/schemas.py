@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field
 
 from jobs.job import Job, JobState
 from jobs.progress import ProgressReport
+from service.access import Caller
 
 
 class JobSummary(BaseModel):
@@ -34,7 +35,9 @@ class JobResource(JobSummary):
     """A training job."""
 
     capture: str = Field(description="sha256 of the uploaded archive.")
-    webhook: str | None = Field(description="Address that is told what happens to the job.")
+    webhook: str | None = Field(
+        description="Address that is told what happens to the job; null for who may only look at the job."
+    )
     webhook_secret: str | None = Field(None, description="Verifies its messages; only in the answer to the submission.")
     config: dict[str, Any] = Field(description="All options of the run; `GET /options` has their schema.")
 
@@ -72,11 +75,10 @@ class Readiness(BaseModel):
     free_mb: int = Field(description="Free space in the data folder, in MB.")
 
 
-def job_resource(job: Job) -> JobResource:
-    """The resource of a job."""
-    return JobResource(
-        **dict(job_summary(job)), capture=job.spec.capture, webhook=job.spec.webhook, config=job.spec.config
-    )
+def job_resource(job: Job, caller: Caller) -> JobResource:
+    """The resource of a job, as the caller may see it: the address of a webhook is often a secret by itself."""
+    webhook = job.spec.webhook if caller.may_change else None
+    return JobResource(**dict(job_summary(job)), capture=job.spec.capture, webhook=webhook, config=job.spec.config)
 
 
 def job_summary(job: Job) -> JobSummary:

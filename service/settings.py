@@ -44,7 +44,8 @@ class Settings(BaseModel):
     )
     render_threads: int = Field(1, ge=1, le=256, description="CPU threads per image.")
     key_requests: int = Field(3_000, ge=1, description="Requests that a key may send in a minute.")
-    key_open_requests: int = Field(64, ge=1, description="Requests of a key, event streams included, at a time.")
+    key_open_requests: int = Field(64, ge=1, description="Requests of a key at a time, without event streams.")
+    key_open_streams: int = Field(64, ge=1, description="Event streams of a key at a time: pages on a running job.")
 
     @property
     def database_url(self) -> str:

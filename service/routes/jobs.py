@@ -11,7 +11,7 @@ from pydantic import HttpUrl
 
 from graings.config import PRESETS, make_config, merged
 from jobs.job import ID_PATTERN, Job, JobSpec, JobState
-from service.access import CallerDep
+from service.access import Caller, CallerDep
 from service.context import ContextDep, JobId
 from service.inspection import inspect_capture
 from service.problems import RESPONSES
@@ -66,13 +66,13 @@ async def submit(
         job = await to_thread.run_sync(context.jobs.submit, spec, folder, idempotency_key)
         if sent.upload is not None and not sent.stored:  # once: another job does not put off its expiry
             await to_thread.run_sync(sent.upload.write, sent.digest)
-    return _accepted(job, response)
+    return _accepted(job, caller, response)
 
 
-def _accepted(job: Job, response: Response) -> JobResource:
+def _accepted(job: Job, caller: Caller, response: Response) -> JobResource:
     response.headers["Location"] = f"/jobs/{job.id}"
     response.headers["Retry-After"] = RETRY_AFTER_S
-    return job_resource(job).model_copy(update={"webhook_secret": job.spec.webhook_secret})
+    return job_resource(job, caller).model_copy(update={"webhook_secret": job.spec.webhook_secret})
 
 
 @router.get("", operation_id="list_jobs")
@@ -96,40 +96,41 @@ def page(
 
 
 @router.get("/{job_id}", operation_id="get_job")
-def get(job_id: JobId, response: Response, context: ContextDep) -> JobResource:
+def get(job_id: JobId, response: Response, context: ContextDep, caller: CallerDep) -> JobResource:
     """A job with its state and progress."""
     job = context.jobs.get(job_id)
     if not job.state.final:
         response.headers["Retry-After"] = RETRY_AFTER_S
-    return job_resource(job)
+    return job_resource(job, caller)
 
 
 @router.post("/{job_id}/cancel", status_code=202, operation_id="cancel_job")
-def cancel(job_id: JobId, context: ContextDep) -> JobResource:
+def cancel(job_id: JobId, context: ContextDep, caller: CallerDep) -> JobResource:
     """Stop a job at a checkpoint from which it can be resumed. Cancelling it again changes nothing."""
-    return job_resource(context.jobs.cancel(job_id))
+    return job_resource(context.jobs.cancel(job_id), caller)
 
 
 @router.post("/{job_id}/resume", status_code=202, operation_id="resume_job")
-def resume(job_id: JobId, context: ContextDep) -> JobResource:
+def resume(job_id: JobId, context: ContextDep, caller: CallerDep) -> JobResource:
     """Queue a cancelled job again; it continues where it stopped. Resuming it again changes nothing."""
-    return job_resource(context.jobs.resume(job_id))
+    return job_resource(context.jobs.resume(job_id), caller)
 
 
 @router.post("/{job_id}/retry", status_code=202, operation_id="retry_job")
-def retry(job_id: JobId, context: ContextDep) -> JobResource:
+def retry(job_id: JobId, context: ContextDep, caller: CallerDep) -> JobResource:
     """Queue a failed or diverged job again; it continues from its last checkpoint, if any."""
-    return job_resource(context.jobs.retry(job_id))
+    return job_resource(context.jobs.retry(job_id), caller)
 
 
 @router.post("/{job_id}/extend", status_code=202, operation_id="extend_job")
 def extend(
     job_id: JobId,
     context: ContextDep,
+    caller: CallerDep,
     iterations: Annotated[int, Query(ge=1, le=1_000_000, description="How many more.")],
 ) -> JobResource:
     """Train a job that has succeeded for more iterations, from its last checkpoint; its model stays until then."""
-    return job_resource(context.jobs.extend(job_id, iterations))
+    return job_resource(context.jobs.extend(job_id, iterations), caller)
 
 
 @router.delete("/{job_id}", status_code=204, operation_id="delete_job")

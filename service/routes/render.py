@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
+from contextlib import ExitStack
 from time import perf_counter
 from typing import Annotated, Any
 
 import numpy as np
 from anyio import to_thread
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Depends, Header, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 from werkzeug.datastructures import MIMEAccept
 from werkzeug.http import parse_accept_header
@@ -114,11 +115,18 @@ class RenderQuery(BaseModel):
     )
 
 
+async def _until_sent() -> AsyncIterator[ExitStack]:
+    """What a request holds until its response was sent."""
+    with ExitStack() as held:
+        yield held
+
+
 @router.get("/render", operation_id="render", response_class=Response, responses={**_IMAGES, **RESPONSES})
 async def render(
     query: Annotated[RenderQuery, Query()],
     context: ContextDep,
     caller: CallerDep,
+    held: Annotated[ExitStack, Depends(_until_sent)],
     accept: Annotated[str | None, Header()] = None,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Response:
@@ -149,6 +157,7 @@ async def render(
         headers["X-Graings-Orbit"] = _orbit_header(view, camera, model.units)
     if matches(if_none_match, headers["ETag"]):
         return Response(status_code=304, headers=headers)
+    held.enter_context(context.pixel_limit.held(camera.width * camera.height))
     resolved = perf_counter()
     image = await context.pool.render(loaded, request, headers["ETag"])
     if request.fast:

@@ -16,6 +16,7 @@ from graings.report.metrics_document import Metrics
 from graings.report.work_precision_document import REPORT_FILE, WorkPrecision
 from jobs.job import Job, JobNotFound, JobState
 from jobs.progress import last_start, read_progress
+from service.access import CallerDep
 from service.context import ContextDep, JobId
 from service.problems import RESPONSES, NotYet
 from service.schemas import job_resource
@@ -108,6 +109,7 @@ async def _known(job_id: JobId, here: ContextDep) -> Job:
 async def events(
     request: Request,
     here: ContextDep,
+    caller: CallerDep,
     job: Annotated[Job, Depends(_known)],
     last_event_id: Annotated[
         int | None, Header(ge=0, description="Continue after this event; 0 starts at the first report.")
@@ -131,9 +133,9 @@ async def events(
             yield ServerSentEvent(event="progress", id=str(place), data=report, retry=RECONNECT_MS)
         if job.state is not state:
             state = job.state
-            yield ServerSentEvent(event="state", data=job_resource(job))
+            yield ServerSentEvent(event="state", data=job_resource(job, caller))
         if state.final:
-            yield ServerSentEvent(event="end", data=job_resource(job))
+            yield ServerSentEvent(event="end", data=job_resource(job, caller))
             return
         await sleep(POLL_S)
 

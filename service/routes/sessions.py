@@ -51,8 +51,9 @@ def begin_session(request: Request, response: Response, context: ContextDep, hea
     key = context.keys.find(header.credentials) if header else None
     if key is None or key.kind == "session":
         raise Unauthorized(header is not None)
-    context.keys.discard_expired()
-    _, secret = context.keys.create(key.name, key.scope, "session", parent=key.id, job=key.job)
+    with context.request_limits.counted(key.counted_as):
+        context.keys.discard_expired()
+        _, secret = context.keys.create(key.name, key.scope, "session", parent=key.id, job=key.job)
     secure = request.url.scheme == "https"
     response.set_cookie(COOKIE, secret, max_age=int(SESSION_S), httponly=True, samesite="strict", secure=secure)
 

@@ -12,11 +12,13 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import BaseModel, Field
 
+from graings.config import make_config
 from service.access import CallerDep
 from service.context import MB, ContextDep
 from service.problems import RESPONSES, BadRequest, UploadConflict
 from service.resumable import ResumableUpload
 from service.sent_capture import owned_upload
+from service.uploads import parse_config
 
 router = APIRouter(prefix="/uploads", tags=["uploads"], responses=RESPONSES)
 
@@ -62,8 +64,14 @@ def begin(
     context: ContextDep,
     caller: CallerDep,
     size: Annotated[int, Query(alias="bytes", ge=1, description="Size of the archive.")],
+    preset: Annotated[str, Query(description="That of the job to come: a wrong one is refused.")] = "standard",
+    config: Annotated[str | None, Query(description="Options of the job to come: wrong ones are refused.")] = None,
 ) -> UploadResource:
-    """Begin an upload that can be continued after an interruption. It belongs to the key of the request."""
+    """Begin an upload that can be continued after an interruption. It belongs to the key of the request.
+
+    `preset` and `config` are only checked, so that a typing error is reported before gigabytes are uploaded.
+    """
+    make_config(preset, {} if config is None else parse_config(config, "config"))
     if size > context.settings.max_upload_mb * MB:
         raise BadRequest(f"bytes: an archive may have at most {context.settings.max_upload_mb * MB} bytes.")
     upload = context.resumable.begin(size, caller.owner)

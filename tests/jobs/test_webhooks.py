@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import socket
 import sqlite3
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
@@ -188,3 +189,33 @@ def test_a_message_of_a_dead_worker_is_delivered_by_another(jobs: JobQueue) -> N
     assert engine.taken() == {}
     assert [status.workflow_id for status in engine._in_state("ENQUEUED", MESSAGES)] == [message.workflow_id]
     engine.close()
+
+
+@pytest.mark.parametrize("answer", [b"HTTP/1.1 200 OK\r\nX-Slow: " + b"a" * 1_000, b"H" * 1_000])
+def test_a_receiver_that_answers_byte_by_byte_has_one_deadline(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
+    """Else four of them hold all places of deliveries for ever."""
+    monkeypatch.setattr("jobs.webhooks.TIMEOUT_S", 0.5)
+    stop = threading.Event()
+
+    def drip(server: socket.socket) -> None:
+        connection, _ = server.accept()
+        with connection, suppress(OSError):
+            for byte in answer:
+                if stop.wait(0.1):
+                    return
+                connection.sendall(bytes([byte]))
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        thread = threading.Thread(target=drip, args=(server,))
+        thread.start()
+        limit = threading.Timer(8.0, stop.set)  # so that the test ends where there is no deadline
+        limit.start()
+        began = time.monotonic()
+        try:
+            with pytest.raises(WebhookError, match=r"within 0\.5 s"):
+                send(f"http://127.0.0.1:{server.getsockname()[1]}/", True)
+            assert time.monotonic() - began < 4.0
+        finally:
+            limit.cancel()
+            stop.set()
+            thread.join()

@@ -19,8 +19,6 @@ from service.app import create_app
 from service.commands import serve
 from service.key_commands import app as key_commands
 from service.keys import Keys, Scope
-from service.problems import TooManyRequests
-from service.request_limits import RequestLimits
 from service.security_headers import HEADERS
 from service.settings import Settings
 from tests.service.test_jobs import problem
@@ -29,7 +27,6 @@ from tests.service.test_jobs import problem
 OPEN = {"get_health", "get_readiness", "get_session", "begin_session", "end_session"}
 LOOKS = {"get_job", "list_jobs", "get_events", "render", "get_scene", "get_views"}  # all that a link allows
 CALLERS = ("no key", "view", "read", "train", "admin", "other", "wrong")
-NOT_FOUND = "0000000000000000"
 
 
 @pytest.fixture
@@ -92,19 +89,17 @@ def allowed(client: TestClient, method: str, path: str, job: str, headers: dict[
 def table(client: TestClient, keys: Keys, capture: Path) -> dict[str, dict[str, str]]:
     """What happens to each operation by caller: a refusing status, or that it passes.
 
-    The job of every request belongs to `train`, except that `read` asks for one of its own.
+    The job of every request belongs to `train`, for which `read` was made.
     """
     owner, train = keys.create("train", Scope.TRAIN)
-    reader, read = keys.create("read", Scope.READ)
+    _, read = keys.create("read", Scope.READ, parent=owner.id)
     secrets = {"train": train, "read": read, "wrong": train[:-4] + "AAAA"}
     secrets |= {"admin": keys.create("a", Scope.ADMIN)[1], "other": keys.create("other", Scope.TRAIN)[1]}
     rows: dict[str, dict[str, str]] = {}
     for name, method, path in operations(client):
         rows[name] = {}
         for caller in CALLERS:
-            job = add_job(
-                client, capture, reader.id if caller == "read" else owner.id, f"{name}-{caller}", cancelled=True
-            )
+            job = add_job(client, capture, owner.id, f"{name}-{caller}", cancelled=True)
             secrets["view"] = keys.create("link", Scope.VIEW, "link", parent=owner.id, job=job)[1]
             headers = {} if caller == "no key" else bearer(secrets[caller])
             rows[name][caller] = allowed(client, method, path, job, headers)
@@ -161,7 +156,7 @@ def test_every_route_is_behind_the_check_or_named_as_open(client: TestClient) ->
 def test_jobs_and_images_are_those_of_the_caller(
     closed: TestClient, keys: Keys, capture: Path, trained: Path, settings: Settings
 ) -> None:
-    (first, first_secret), (second, second_secret) = keys.create("1", Scope.READ), keys.create("2", Scope.READ)
+    (first, first_secret), (second, second_secret) = keys.create("1", Scope.TRAIN), keys.create("2", Scope.TRAIN)
     admin = keys.create("admin", Scope.ADMIN)[1]
     jobs = {owner: add_job(closed, capture, owner, str(owner)) for owner in (first.id, second.id, None)}
     shutil.copytree(trained, settings.data / "jobs" / jobs[first.id] / "run")
@@ -176,9 +171,24 @@ def test_jobs_and_images_are_those_of_the_caller(
     assert listed(admin) == set(jobs.values())
     for secret, status in ((first_secret, 200), (admin, 200), (second_secret, 404)):
         assert closed.get("/render", params={"width": 8}, headers=bearer(secret)).status_code == status
-    (settings.data / "jobs" / jobs[first.id] / "job.json").write_text("damaged")
-    assert closed.get(f"/jobs/{jobs[first.id]}", headers=bearer(first_secret)).status_code == 404
-    assert closed.get(f"/jobs/{jobs[first.id]}", headers=bearer(admin)).json()["state"] == "queued"
+
+
+@pytest.mark.parametrize(("file", "seen"), [("job.json", False), ("attempts.json", True)])
+def test_a_damaged_job_is_listed_and_deleted_by_its_owner_or_where_that_is_lost_by_an_admin(
+    closed: TestClient, keys: Keys, capture: Path, settings: Settings, file: str, seen: bool
+) -> None:
+    owner, secret = keys.create("owner", Scope.TRAIN)
+    admin = keys.create("admin", Scope.ADMIN)[1]
+    job = add_job(closed, capture, owner.id, cancelled=True)
+    (settings.data / "jobs" / job / file).write_text("damaged")
+    for headers, visible in ((bearer(secret), seen), (bearer(admin), True)):
+        listed = closed.get("/jobs", headers=headers).json()["jobs"]
+        assert [file in entry["error"] for entry in listed] == [True] * visible
+        assert closed.get(f"/jobs/{job}", headers=headers).status_code == (200 if visible else 404)
+    if not seen:
+        assert closed.delete(f"/jobs/{job}", headers=bearer(secret)).status_code == 404
+    assert closed.delete(f"/jobs/{job}", headers=bearer(secret if seen else admin)).status_code == 204
+    assert closed.get("/jobs", headers=bearer(admin)).json()["jobs"] == []
 
 
 def test_a_submitted_job_belongs_to_the_key(closed: TestClient, keys: Keys, archive: bytes) -> None:
@@ -211,12 +221,12 @@ def test_a_session_of_a_page(closed: TestClient, keys: Keys, capture: Path) -> N
 def test_a_session_ends_with_its_key_and_with_time(
     closed: TestClient, keys: Keys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key, secret = keys.create("me", Scope.READ)
+    key, secret = keys.create("me", Scope.TRAIN)
     closed.post("/session", headers=bearer(secret))
     assert closed.get("/jobs").status_code == 200
     keys.revoke(key)
     assert closed.get("/jobs").status_code == 401
-    secret = keys.create("again", Scope.READ)[1]
+    secret = keys.create("again", Scope.TRAIN)[1]
     closed.post("/session", headers=bearer(secret))
     monkeypatch.setattr("service.keys.SESSION_S", -1.0)
     closed.post("/session", headers=bearer(secret))
@@ -226,7 +236,7 @@ def test_a_session_ends_with_its_key_and_with_time(
 
 
 def test_over_https_the_cookie_of_a_session_is_secure(settings: Settings, keys: Keys) -> None:
-    secret = keys.create("me", Scope.READ)[1]
+    secret = keys.create("me", Scope.TRAIN)[1]
     with TestClient(create_app(settings), base_url="https://testserver") as client:
         assert "; secure" in client.post("/session", headers=bearer(secret)).headers["set-cookie"].lower()
 
@@ -256,30 +266,13 @@ def test_a_link_shows_one_job_until_it_is_revoked(closed: TestClient, keys: Keys
 
 def test_a_key_may_send_so_many_requests_in_a_minute(settings: Settings, keys: Keys) -> None:
     few = settings.model_copy(update={"key_requests": 3})
-    first, second = keys.create("1", Scope.READ)[1], keys.create("2", Scope.READ)[1]
+    first, second = keys.create("1", Scope.TRAIN)[1], keys.create("2", Scope.TRAIN)[1]
     with TestClient(create_app(few)) as client:
         assert [client.get("/options", headers=bearer(first)).status_code for _ in range(4)] == [200, 200, 200, 429]
         answer = client.get("/options", headers=bearer(first))
         assert problem(answer, 429)["type"].endswith("too-many-requests")
         assert 1 <= int(answer.headers["retry-after"]) <= 60
         assert client.get("/options", headers=bearer(second)).status_code == 200
-
-
-def test_a_key_may_have_so_many_requests_open(settings: Settings, keys: Keys, capture: Path) -> None:
-    limits = RequestLimits(1_000, 2)
-    limits.begin("a")
-    limits.begin("a")
-    with pytest.raises(TooManyRequests, match="2 open requests"):
-        limits.begin("a")
-    limits.begin("b")
-    limits.end("a")
-    limits.begin("a")
-    # A request frees its place when it ends, also by an error.
-    one = settings.model_copy(update={"key_open_requests": 1})
-    headers = bearer(keys.create("1", Scope.READ)[1])
-    with TestClient(create_app(one)) as client:
-        assert [client.get(f"/jobs/{NOT_FOUND}", headers=headers).status_code for _ in range(3)] == [404] * 3
-        assert [client.get("/options", headers=headers).status_code for _ in range(3)] == [200] * 3
 
 
 @pytest.mark.parametrize("path", ["/", "/docs", "/web/page.js", "/jobs", "/nowhere", "/healthz", "/session"])

@@ -77,6 +77,41 @@ def test_a_folder_is_packed_sent_and_queued(
         remote.job(job.id)
 
 
+def test_a_submission_whose_answer_is_lost_makes_one_job(url: str, capture: Path) -> None:
+    lost: list[httpx2.Request] = []
+
+    class Lossy(httpx2.HTTPTransport):
+        def handle_request(self, request: httpx2.Request) -> httpx2.Response:
+            response = super().handle_request(request)
+            if (request.method, request.url.path) == ("POST", "/jobs") and len(lost) < 2:
+                lost.append(request)
+                response.close()
+                raise httpx2.ReadError("broke", request=request)
+            return response
+
+    with Client(url, transport=Lossy()) as client:
+        job = client.submit(capture, preset="draft")
+        assert [entry.id for entry in client.jobs()] == [job.id]
+    assert len(lost) == 2
+
+
+def test_what_is_refused_leaves_nothing_behind(
+    remote: Client, capture: Path, settings: Settings, tmp_path: Path
+) -> None:
+    """A wrong option is refused before the capture is sent; a wrong capture is not kept."""
+    sent: list[int] = []
+    for wrong in ({"preset": "nonsense"}, {"config": {"iterations": -1}}):
+        with pytest.raises(RefusedError) as refused:
+            remote.submit(capture, observe=lambda now, all: sent.append(now), **wrong)  # type: ignore[arg-type]
+        assert refused.value.status == 422
+    assert sent == []
+    (tmp_path / "capture.zip").write_bytes(b"no archive")
+    with pytest.raises(RefusedError, match="archive"):
+        remote.submit(tmp_path / "capture.zip")
+    assert list((settings.data / "resumable").iterdir()) == []
+    assert list(remote.jobs()) == []
+
+
 def test_a_capture_whose_files_have_no_time_is_packed(tmp_path: Path) -> None:
     """Archives and containers that are built to have the same bytes give their files the time 0; zip begins in 1980."""
     (tmp_path / "old").mkdir()

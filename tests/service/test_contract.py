@@ -31,7 +31,9 @@ LONG_S = 120.0
 # of the capture, an image in no format that we have.
 FUZZ = """
 [[operations]]
-include-operation-id = ["submit_job", "plan_training", "inspect_capture", "render", "get_export", "get_comparison"]
+include-operation-id = [
+    "begin_upload", "submit_job", "plan_training", "inspect_capture", "render", "get_export", "get_comparison"
+]
 checks.positive_data_acceptance.expected-statuses = ["2xx", "3xx", 400, 401, 403, 404, 406, 409, 413, 422, 429, "5xx"]
 
 [parameters]
