@@ -369,9 +369,9 @@ def test_a_damaged_checkpoint_is_named(capture: Path, tmp_path: Path) -> None:
         load_model(tmp_path / "run")
 
 
-@pytest.mark.parametrize("room", [4_096, 600_000])  # not enough for the scene; for the scene, not for the state
+@pytest.mark.parametrize("too_large", ["scene.safetensors", "state.safetensors"])
 def test_a_disk_too_full_keeps_the_checkpoint_before_and_says_what_to_do(
-    capture: Path, tmp_path: Path, room: int
+    capture: Path, tmp_path: Path, too_large: str
 ) -> None:
     folder = tmp_path / "run"
     run = TrainingRun.create(capture, folder, _config())
@@ -379,6 +379,10 @@ def test_a_disk_too_full_keeps_the_checkpoint_before_and_says_what_to_do(
     next(steps)
     run.save()
     before = newest_checkpoint(folder)
+    assert before is not None
+    sizes = {file.name: file.stat().st_size for file in before.iterdir()}
+    assert sizes["scene.safetensors"] < sizes["state.safetensors"]  # which is written second
+    room = sizes[too_large] - 1_000
     next(steps)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limit[1]))

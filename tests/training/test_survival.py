@@ -239,7 +239,7 @@ def test_zero_and_tiny_gradients_do_not_change_parameters(micro: Path, number: f
     before = {name: value.detach().clone() for name, value in trainer.scene.named_parameters()}
     for name in before:
         spoil_gradient(trainer, name, lambda _: True, everywhere(number))
-    assert events_of(steps(trainer, 100)) == []
+    assert {event.kind for event in events_of(steps(trainer, 100))} <= {"initial_points"}
     assert finite(trainer)
     for name, value in trainer.scene.named_parameters():
         assert float((value.detach() - before[name]).abs().max()) <= drift, name
