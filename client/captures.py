@@ -9,9 +9,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
+import httpx2
+
 from client import calls
 from client.answers import ClientError, RefusedError, RemoteJob
-from client.retry_limit import RetryLimit
+from client.retry_limit import TRANSIENT, RetryLimit
 
 T = TypeVar("T")
 
@@ -87,13 +89,19 @@ def uploading(archive: Path, observe: Observe | None, how: calls.Query | None = 
     return upload_id
 
 
-def requesting(call: calls.Call[RemoteJob]) -> Steps[RemoteJob]:
-    """The request for a job, until it is answered; all have its key, so that they make one job."""
-    limit, pause = RetryLimit(UPLOAD_TAKEN), 0.0
+def requesting(call: calls.Call[RemoteJob], *also: int, reached: bool = False) -> Steps[RemoteJob]:
+    """The request for a job, until it is answered; all have its key, so that they make one job.
+
+    `also` are further statuses after which it is sent again. A service that was never `reached` is not waited for.
+    """
+    limit, pause = RetryLimit(*also), 0.0
     while True:
         try:
             job: RemoteJob = yield call, None, pause
         except ClientError as error:
+            if not reached and isinstance(error.__cause__, httpx2.ConnectError):
+                raise
+            reached = True
             limit.failed(error)
             limit.check()
             pause = calls.RECONNECT_S
@@ -106,12 +114,14 @@ def submitting(
 ) -> Steps[RemoteJob]:
     """The requests that bring an archive to the service and make a job of it; `request` gets the id of the upload.
 
-    Where the job is refused, the upload is deleted.
+    Where the job is refused for good, the upload is deleted. After a minute without an answer it stays for its day: the
+    service may still make a job of it.
     """
     upload_id = yield from uploading(archive, observe, how)
     try:
-        return (yield from requesting(request(upload_id)))
-    except RefusedError:
-        with suppress(ClientError):  # the caller must hear of the refusal
-            yield calls.delete_upload(upload_id), None, 0.0
+        return (yield from requesting(request(upload_id), UPLOAD_TAKEN, reached=True))
+    except RefusedError as error:
+        if error.status not in TRANSIENT | {UPLOAD_TAKEN}:
+            with suppress(ClientError):  # the caller must hear of the refusal
+                yield calls.delete_upload(upload_id), None, 0.0
         raise

@@ -137,14 +137,14 @@ def row_config(row: Row, preset: str, settings: Mapping[str, Any], seed: int) ->
     same = nothing_to_compare(row, preset, settings)
     if same is not None:
         raise ConfigError(f"{same} Raise it, or leave the row out (--rows).")
-    given = dotted(merged(settings))
+    given, config = dotted(merged(settings)), make_config(preset, dict(settings))
     if "seed" in given:
         raise ConfigError("seed: an ablation gives every row the same seeds. Leave it out and use --seeds.")
     # Loss weights are not compared: the user's is that of the other rows.
     for key in METHOD:
-        if key in given and given[key] != row.options[key]:
+        if key in given and _option(config, key) != row.options[key]:
             raise ConfigError(
-                f"{key}: is set to {given[key]!r}, but the row {row.name} is {row.options[key]!r} there. "
+                f"{key}: is set to {_option(config, key)!r}, but the row {row.name} is {row.options[key]!r} there. "
                 "Leave the setting out, or name the rows that agree with it (--rows)."
             )
     return combined(row, preset, settings, seed)

@@ -110,7 +110,7 @@ class SceneConfig(ConfigSection):
     stop_gradient: bool = Field(True, description="Stop the gradient from DeformNet to the canonical position (Eq. 7).")
     single_mlp: bool = Field(
         False,
-        description="Ablation: a single network for canonical geometry and deformation. It needs `deformation`.",
+        description="Ablation: a single network for canonical geometry and deformation. Not with `deformation=none`.",
     )
     residual: bool = Field(True, description="Temporal appearance residual (Eq. 12).")
     residual_sh_degree: int = Field(
@@ -155,7 +155,7 @@ class SceneConfig(ConfigSection):
     def _single_mlp_moves(self) -> SceneConfig:
         if self.single_mlp and self.deformation == "none":
             raise ValueError(
-                "single_mlp moves the Gaussians, and deformation=none says that nothing moves. Set one only."
+                "scene.single_mlp moves the Gaussians, and with scene.deformation=none nothing moves. Set one only."
             )
         return self
 

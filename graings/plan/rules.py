@@ -149,7 +149,9 @@ def _temporal_loss(statistics: CaptureStatistics, config: TrainConfig, static: b
         return Decision(component="temporal_loss", decision="drop", kind="user", reason="loss.temporal is 0")
     one = single_time(statistics)
     if static:
-        return _dropped("temporal_loss", "exact", "no pair of times" if one.holds else "nothing moves", one)
+        return _dropped(
+            "temporal_loss", "exact", *(("no pair of times", one) if one.holds else ("nothing moves", None))
+        )
     reason = f"{statistics.times} distinct training times"
     return Decision(component="temporal_loss", decision="keep", kind="exact", reason=reason, condition=one)
 

@@ -23,7 +23,7 @@ class BackgroundFound(TrainingEvent):
 
 
 class PointsInitialized(TrainingEvent):
-    """Where the first anchors come from, in a capture without point cloud whose masks do not tell."""
+    """Where the first anchors come from, in a capture without a point cloud whose masks do not show the objects."""
 
     kind: Literal["initial_points"] = Field("initial_points", description=KIND)
     source: Literal["random", "triangulation"] = Field(
@@ -32,11 +32,11 @@ class PointsInitialized(TrainingEvent):
     triangulated: int | None = Field(
         None,
         ge=0,
-        description="Points matched between pairs of images; null where that was not tried, or not without the extra "
+        description="Points matched between pairs of images; null where it was not tried. It needs the extra "
         "graings[colmap].",
     )
     within_masks: int | None = Field(
-        None, ge=0, description="Random points within the masks, where these were too few; null where masks are full."
+        None, ge=0, description="Random points within the masks, where these were too few; null otherwise."
     )
     interpolated: int = Field(0, ge=0, description="Points added between the triangulated ones.")
 

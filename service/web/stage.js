@@ -16,6 +16,7 @@ export class Stage {
     this.shown = null; // address of the scene that is loaded or being loaded
     this.loaded = 0;
     this.loading = false;
+    this.loads = 0; // how many were begun
     this.failed = false; // whether the last scene could not be loaded
     this.player = new Player(root, {
       worker: "/web/player/sort_worker.js",
@@ -95,8 +96,10 @@ export class Stage {
       return;
     }
     const { job } = this;
+    const number = ++this.loads;
     this.loading = true;
     const error = await this.player.load(address).then(() => null, (refused) => refused);
+    if (number !== this.loads) return; // another scene is being loaded
     this.loading = false;
     this.loaded = Date.now();
     if (this.job?.id !== job.id) return;

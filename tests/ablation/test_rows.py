@@ -66,7 +66,7 @@ def test_the_papers_differences_are_those_of_its_tables() -> None:
     assert {row.name: row.paper.difference if row.paper else None for row in ROWS} == PAPER
 
 
-@pytest.mark.parametrize("form", [{"scene.residual": True}, {"scene": {"residual": True}}])
+@pytest.mark.parametrize("form", [{"scene.residual": True}, {"scene": {"residual": True}}, {"scene.residual": "True"}])
 def test_a_setting_that_contradicts_a_row_is_refused_and_one_that_agrees_is_not(form: dict[str, Any]) -> None:
     row = chosen_rows(["no_residual"])[0]
     with pytest.raises(ConfigError, match=r"scene\.residual.*no_residual.*--rows"):

@@ -92,7 +92,7 @@ def test_a_loss_that_is_switched_off_is_the_users_decision(component: Any, optio
 def test_a_scene_without_deformation_has_no_temporal_loss_because_nothing_moves() -> None:
     decision = plan_of(**{"scene.deformation": "none"}).decision("temporal_loss")
     assert decision is not None
-    assert (decision.decision, decision.reason) == ("drop", "nothing moves")
+    assert (decision.decision, decision.reason, decision.condition) == ("drop", "nothing moves", None)
 
 
 @pytest.mark.parametrize("times", [1, 8])

@@ -82,7 +82,10 @@ def test_a_request_for_a_job_is_sent_again_with_its_key(
     failure: Failure,
     asynchronously: bool,
 ) -> None:
-    for method, argument in (("submit", packed), ("submit_scene", "walker")):
+    methods = [("submit", packed)]
+    if failure not in (httpx2.ConnectError, 404):
+        methods.append(("submit_scene", "walker"))  # of a scene these are the first and the last answer, below
+    for method, argument in methods:
         service = Service([failure] * 3)
         assert submit(service, asynchronously, method, argument) == "j"
         requests = service.sent("POST", "/jobs")
@@ -90,6 +93,30 @@ def test_a_request_for_a_job_is_sent_again_with_its_key(
         assert len({(request.url, request.headers["idempotency-key"]) for request in requests}) == 1
         assert len(service.sent("POST", "/uploads")) == (method == "submit")
         assert service.sent("DELETE", "/uploads/u") == []
+
+
+@pytest.mark.parametrize("asynchronously", [False, True])
+@pytest.mark.parametrize("failure", [httpx2.ConnectError, 404])
+def test_a_scene_is_not_asked_for_again_where_there_is_no_service(
+    clock: Clock,  # noqa: F811
+    failure: Failure,
+    asynchronously: bool,
+) -> None:
+    service = Service([failure] * 3)
+    with pytest.raises(ClientError, match="answer 404" if failure == 404 else "Is the service running there"):
+        submit(service, asynchronously, "submit_scene", "walker")
+    assert len(service.got) == 1
+    assert clock.now == 1_000
+
+
+@pytest.mark.parametrize("asynchronously", [False, True])
+def test_a_service_that_restarts_while_a_scene_is_asked_for_is_waited_for(
+    clock: Clock,  # noqa: F811
+    asynchronously: bool,
+) -> None:
+    service = Service([httpx2.ReadError, httpx2.ConnectError, httpx2.ConnectError])
+    assert submit(service, asynchronously, "submit_scene", "walker") == "j"
+    assert len(service.sent("POST", "/jobs")) == 4
 
 
 @pytest.mark.parametrize("asynchronously", [False, True])
@@ -101,8 +128,9 @@ def test_a_request_for_a_job_is_given_up_after_a_minute_of_failures(
     asynchronously: bool,
 ) -> None:
     with pytest.raises(ClientError, match="answer 502" if failure == 502 else "does not answer"):
-        submit(Service([failure] * 1_000), asynchronously, "submit", packed)
+        submit(service := Service([failure] * 1_000), asynchronously, "submit", packed)
     assert 60 < clock.now - 1_000 < 70
+    assert service.sent("DELETE", "/uploads/u") == []  # the service may still make a job of it
 
 
 @pytest.mark.parametrize("asynchronously", [False, True])

@@ -92,11 +92,23 @@ def test_the_number_of_initial_anchors_is_limited(large_motion: Path) -> None:
         assert len(most) == (100 if capture is cloud else every)
 
 
-def _small_ball(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Capture:
-    """A ball at rest, of which 20 000 random points hit next to nothing."""
-    ball = _ball(np.array([0.6, 0.0, 0.3]), np.zeros(3), 0.1)
+def _small_ball(folder: Path, monkeypatch: pytest.MonkeyPatch, swing: float = 0.0) -> Capture:
+    """A ball, at rest or swinging, of which 20 000 random points hit next to nothing."""
+    ball = _ball(np.array([0.6, 0.0, 0.3]), np.array([0.0, swing, 0.0]), 0.1)
     monkeypatch.setattr(SyntheticScene, "random", staticmethod(lambda *_: SyntheticScene((ball,))))
-    return load_capture(write_synthetic(folder, frames=16, size=64))
+    return load_capture(write_synthetic(folder, frames=32, size=64))
+
+
+@pytest.mark.parametrize("window", [None, 0.25])
+def test_of_a_small_object_that_moves_far_there_are_points_in_a_part_of_the_clip(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, window: float | None
+) -> None:
+    data = _small_ball(tmp_path / "small", monkeypatch, swing=0.8)
+    config = _draft(**{"init.points": 20_000, "time_window": window})
+    first = initial_points(data, ImageStore(WHITE), config, RandomStreams(0))
+    assert MIN_POINTS < len(first.positions) < 20_000
+    assert first.time_window < 1
+    assert first.notes == ()
 
 
 def test_of_a_small_object_there_are_points_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -147,24 +148,14 @@ def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, st
         notes = (note,)
         if places is not None:
             return InitialPoints(_subsampled(places, surface_limit, generator), window, notes)
-    spacing = 2 * half / len(cube) ** (1 / 3)
-    found = _within_hull(cube, spacing, half, order, whole, capture, images, config)
+    hull = partial(_within_hull, cube, half, order, whole, capture, images, config)
+    found, within = hull()
+    if found is None and within > 0:
+        found, _ = hull(generator)
     if found is None:
-        few = visual_hull(cube, whole, config.init.min_mask_fraction, _cells(half, spacing))
-        if len(few):  # of a small object: look closer
-            low, high = few.min(0) - spacing, few.max(0) + spacing
-            cube_of_few = low + (high - low) * torch.rand(cube.shape, generator=generator, dtype=torch.float64).numpy()
-            closer = float(np.prod(high - low) / len(cube)) ** (1 / 3)
-            found = _within_hull(cube_of_few, closer, half, order, whole, capture, images, config)
-        if found is None:
-            notes = (*notes, PointsInitialized(iteration=0, source="random", within_masks=len(few)))
+        notes = (*notes, PointsInitialized(iteration=0, source="random", within_masks=within))
     inside, window = found or (cube, window)
     return InitialPoints(_subsampled(inside, most, generator), window, notes)
-
-
-def _cells(half: float, spacing: float) -> int:
-    """Cells of the longer image side, each a little smaller than the projected `spacing` of points."""
-    return math.ceil(1.25 * 2 * half / spacing)
 
 
 def _triangulated(capture: Capture, images: ImageStore) -> tuple[NDArray[np.float64] | None, PointsInitialized]:
@@ -197,35 +188,49 @@ def _subsampled(points: NDArray[np.float64], most: int, generator: torch.Generat
 
 
 def _within_hull(
-    points: NDArray[np.float64],
-    spacing: float,
+    cube: NDArray[np.float64],
     half: float,
     order: Sequence[int],
     whole: Sequence[MaskedFrame],
     capture: Capture,
     images: ImageStore,
     config: TrainConfig,
-) -> tuple[NDArray[np.float64], float] | None:
-    """Those of `points` within the visual hull, and the share of the clip it is made of; None where too few are left.
+    closer: torch.Generator | None = None,
+) -> tuple[tuple[NDArray[np.float64], float] | None, int]:
+    """The points of `cube`, of half-size `half`, within the visual hull, and the share of the clip that it is made of.
 
-    `spacing` is that of the points, `half` half the size of what the views see. `whole` are the masks of views of the
-    whole clip; for a part of it the first views in `order` are used.
+    None in their place where they are too few, and how many there were at most. `whole` are the masks of views of the
+    whole clip; for a part of it the first views in `order` are used. With `closer` points are tried again in the box
+    around those that are too few: the objects are small.
     """
-    cells = _cells(half, spacing)
-    best, most = None, -1.0
+    best, most, found = None, -1.0, 0
     for share in WINDOW_FRACTIONS if config.time_window is None else [config.time_window]:
         views = whole if share == 1 else _masked_views(capture, images, config, order, share)
         if config.time_window is None and share < 1 and len(views) < MIN_VIEWS:
             break
-        kept = visual_hull(points, views, config.init.min_mask_fraction, cells)
+        spacing = 2 * half / len(cube) ** (1 / 3)
+        kept = visual_hull(cube, views, config.init.min_mask_fraction, _cells(half, spacing))
+        found = max(found, len(kept))
+        if closer is not None and 0 < len(kept) < MIN_POINTS:
+            low, high = kept.min(0) - spacing, kept.max(0) + spacing
+            box = low + (high - low) * torch.rand(cube.shape, generator=closer, dtype=torch.float64).numpy()
+            spacing = float(np.prod(high - low) / len(box)) ** (1 / 3)
+            kept = visual_hull(box, views, config.init.min_mask_fraction, _cells(half, spacing))
         if len(kept) < MIN_POINTS:
             continue
-        covered = coverage(kept, views, cells)
+        covered = coverage(kept, views, _cells(half, spacing))
+        if closer is not None and covered < MIN_COVERAGE:
+            continue  # where rays of cameras that do not fit happen to meet there are points as well
         if covered > most:
             best, most = (kept, share), covered
         if covered >= MIN_COVERAGE:
             break
-    return best
+    return best, found
+
+
+def _cells(half: float, spacing: float) -> int:
+    """Cells of the longer image side, each a little smaller than the projected `spacing` of points."""
+    return math.ceil(1.25 * 2 * half / spacing)
 
 
 def content_half_size(capture: Capture) -> float:
