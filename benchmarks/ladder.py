@@ -11,7 +11,7 @@ views in dB and its difference to the row above, CPU minutes of training, MB in 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,24 +79,12 @@ def option(config: TrainConfig, name: str) -> Any:
     return value.model_dump() if hasattr(value, "model_dump") else value
 
 
-def nested(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options by dotted name as nested dictionaries."""
-    tree: dict[str, Any] = {}
-    for name, value in options.items():
-        *parts, last = name.split(".")
-        owner = tree
-        for part in parts:
-            owner = owner.setdefault(part, {})
-        owner[last] = value
-    return tree
-
-
 def config_of(index: int, views: int, seed: int, threads: int) -> TrainConfig:
     """Options of row `index` at this many training views."""
     taken = {name: option(FINE, name) for row in ROWS[: index + 1] for name in row.options}
     batch = taken.get("batch", 1)
     run = {"iterations": views // batch, "capture.max_side": 400, "seed": seed, "threads": threads}
-    return make_config("paper", nested({**taken, **run}))
+    return make_config("paper", {**taken, **run})
 
 
 def check_ladder(views: int) -> None:

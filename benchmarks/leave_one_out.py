@@ -18,7 +18,7 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from ladder import nested, option
+from ladder import option
 from runs import finished, train
 
 from graings.config import TrainConfig, make_config
@@ -61,7 +61,7 @@ ADDITIONS = (
 def config_of(addition: Addition, preset: str, seed: int, threads: int) -> TrainConfig:
     """Options of the preset with one addition undone."""
     undone: dict[str, Any] = {name: option(PAPER, name) for name in addition.options}
-    return make_config(preset, nested({**undone, "seed": seed, "threads": threads}))
+    return make_config(preset, {**undone, "seed": seed, "threads": threads})
 
 
 def differs(addition: Addition, preset: str) -> bool:
