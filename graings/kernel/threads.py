@@ -1,7 +1,8 @@
 """Number of CPU threads of this process.
 
-The kernel has its own thread pool. Torch uses one thread: each of its many small operations would end in a barrier
-that may wait for a core used by another process, and its sums would depend on the number of threads.
+The kernel has its own thread pool. Torch and the matrix products of numpy use one thread: each of their many small
+operations would end in a barrier that may wait for a core used by another process, and sums would depend on the number
+of threads.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+from threadpoolctl import threadpool_limits
 
 from graings.kernel.extension import keep_freed_memory
 
@@ -38,6 +40,7 @@ def usable_cores() -> int:
 def use_threads(count: int | None) -> int:
     """Set up this process for `count` CPU threads (None: all usable cores) and return their number."""
     torch.set_num_threads(1)
+    threadpool_limits(1, user_api="blas")
     set_threads(count)
     keep_freed_memory()
     return thread_count()
@@ -47,8 +50,9 @@ def use_threads(count: int | None) -> int:
 def computing_threads(count: int | None) -> Iterator[int]:
     """Compute with `count` CPU threads inside the context (None: all usable cores); as before after it."""
     before, torch_before = _threads, torch.get_num_threads()
-    try:
-        yield use_threads(count)
-    finally:
-        set_threads(before)
-        torch.set_num_threads(torch_before)
+    with threadpool_limits(1, user_api="blas"):
+        try:
+            yield use_threads(count)
+        finally:
+            set_threads(before)
+            torch.set_num_threads(torch_before)

@@ -9,6 +9,27 @@ import sys
 
 import pytest
 
+BLAS = """
+import numpy, torch
+from threadpoolctl import threadpool_info
+from graings.kernel import computing_threads, set_threads, thread_count, use_threads
+def threads():
+    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+before = threads()
+set_threads(3)
+with computing_threads(2) as count:
+    print(count, max(threads(), default=1), torch.get_num_threads())
+print(thread_count(), threads() == before)
+use_threads(2)
+print(thread_count(), max(threads(), default=1), torch.get_num_threads())
+"""
+
+
+def test_torch_and_blas_use_one_thread_and_get_theirs_back() -> None:
+    done = subprocess.run([sys.executable, "-c", BLAS], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["2 1 1", "3 True", "2 1 1"]
+
+
 FAULTS = """
 import resource, sys, torch
 from graings.kernel import use_threads
