@@ -106,16 +106,22 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=None, help="views per step; left out: as the run has it")
     arguments = parser.parse_args()
     run = TrainingRun.resume(arguments.run, threads=arguments.threads)
+    with kernel.computing_threads(run.threads):
+        measure(run, arguments.steps, arguments.batch)
+
+
+def measure(run: TrainingRun, steps: int, batch: int | None) -> None:
+    """Print the milliseconds of the parts of a step, and of a whole one."""
     trainer = run._trainer
-    if arguments.batch is not None:
-        trainer.config = trainer.config.model_copy(update={"batch": arguments.batch})
-    trainer.iteration = min(trainer.iteration, run.iterations - 2 * arguments.steps - 10)
+    if batch is not None:
+        trainer.config = trainer.config.model_copy(update={"batch": batch})
+    trainer.iteration = min(trainer.iteration, run.iterations - 2 * steps - 10)
     for _ in range(5):
         trainer.step()
     watch = Stopwatch()
-    counts = [measured_step(trainer, watch) for _ in range(arguments.steps)]
+    counts = [measured_step(trainer, watch) for _ in range(steps)]
     whole = []
-    for _ in range(arguments.steps):
+    for _ in range(steps):
         started = time.perf_counter()
         trainer.step()
         whole.append(1e3 * (time.perf_counter() - started))
@@ -123,7 +129,7 @@ def main() -> None:
     print(
         f"{camera.width}x{camera.height} px, iteration {trainer.iteration}, {statistics.median(counts):.0f} drawn, "
         f"{trainer.scene.scaffold.count} anchors, "
-        f"{trainer.config.batch} views a step, {kernel.thread_count()} threads, median of {arguments.steps} steps"
+        f"{trainer.config.batch} views a step, {kernel.thread_count()} threads, median of {steps} steps"
     )
     total = 0.0
     for name, values in watch.parts.items():

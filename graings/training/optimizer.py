@@ -16,6 +16,7 @@ from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 from graings.training.guard.guard import Gradient
 from graings.training.muon import Muon
+from graings.training.subnormals import flushed_subnormals
 
 # Learning rates are those of one view per step; with more views they are multiplied by their number to this power.
 # Steps of four views at 1.5 times the rates reach the same quality as twice as many steps of two views
@@ -108,7 +109,9 @@ class Optimizer:
             group["lr"] = self.damping * self.rate(group["name"], iteration)
             if group["name"] == "anchors":
                 group["lr"] *= self.extent
-        self.adam.step()
+        # The first moment of an anchor that no view shows decays by a tenth per step and would stay subnormal for ever.
+        with flushed_subnormals():
+            self.adam.step()
         self.muon.step([self.damping * self.rate(MATRICES, iteration, like=group) for group in self._muon_groups])
         self.clear()
 
