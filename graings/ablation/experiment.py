@@ -44,6 +44,12 @@ class AblationRun:
         """Whether the folder holds the metrics of the last iteration."""
         return _final_metrics(self.folder, self.config.iterations) is not None
 
+    @property
+    def diverged(self) -> bool:
+        """Whether it ended because training diverged. Resumed, it may end the same way."""
+        file = self.folder / METRICS_FILE
+        return file.exists() and read_metrics(file).diverged
+
 
 class Ablation:
     """The runs of `rows` x `seeds` on one capture under one set of options. Iterating it opens what is unfinished.
@@ -96,8 +102,11 @@ class Ablation:
             self._check(run)
 
     def pending(self) -> tuple[AblationRun, ...]:
-        """Runs that are not finished, in the order of training: all rows of a seed, then the next seed."""
-        return tuple(run for run in self.runs if not run.finished)
+        """Runs that are not finished, in the order of training: all rows of a seed, then the next seed.
+
+        Runs that diverged come last, so that none keeps the others from being trained.
+        """
+        return tuple(sorted((run for run in self.runs if not run.finished), key=lambda run: run.diverged))
 
     def __iter__(self) -> Iterator[tuple[AblationRun, TrainingRun]]:
         """Each unfinished run, new or resumed, for the caller to iterate; the table is rewritten before and after."""

@@ -13,8 +13,8 @@ from graings.cli.terminal import busy_status, print_line
 from graings.cli.training import Settings, setting
 from graings.config import make_config
 from graings.inspection.inspect import inspect_capture
-from graings.plan.cost import stored_calibration
 from graings.storage.files import check_writable, write_bytes
+from graings.training.calibration import kept_calibration
 
 
 def inspect(
@@ -31,9 +31,14 @@ def inspect(
         if picture.suffix.lower() != ".png":
             raise typer.BadParameter(f"{picture} must end in .png, the format of the picture", param_hint="--picture")
         check_writable(picture)
-    config = make_config(overrides=dict(setting(text) for text in settings or ()))
+    overrides = dict(setting(text) for text in settings or ())
+    for name in overrides:
+        if name.partition(".")[0] != "capture":
+            problem = f"{name} is no option of reading a capture (capture.*). For others: graings plan --set"
+            raise typer.BadParameter(problem, param_hint="--set")
+    config = make_config(overrides=overrides)
     with busy_status("reading the capture, and matching its pictures"):
-        document, png = inspect_capture(capture, config.capture, stored_calibration())
+        document, png = inspect_capture(capture, config.capture, kept_calibration())
     if picture is not None:
         write_bytes(picture, png)
     if as_json:

@@ -19,6 +19,7 @@ from graings.cli.interrupt import Interrupt
 from graings.cli.progress import TrainingProgress
 from graings.cli.terminal import busy_status, metrics_line, print_line
 from graings.config import PRESETS, make_config
+from graings.errors import DivergedError
 from graings.plan.contradictions import nothing_shown
 from graings.report.metrics_document import read_metrics
 from graings.storage.checkpoint import newest_checkpoint
@@ -124,7 +125,12 @@ def ablate(
     print_line(f"{len(ablation.runs)} runs, {len(ablation.runs) - left} of them finished.")
     for job, run in ablation:
         print_line(f"{job.row.label}, seed {job.seed}: {left} to go")
-        interrupt = _take_steps(run, again="Then run the same command again to continue.")
+        try:
+            interrupt = _take_steps(run, again="Then run the same command again to continue.")
+        except DivergedError as error:
+            print_line(str(error))
+            left -= 1
+            continue
         if run.iteration >= run.iterations:
             _print_result(run)
             left -= 1
@@ -139,6 +145,10 @@ def ablate(
                 f"{row.label:>22}  {mean:.2f} dB" + (f"  {signed(difference)}" if difference is not None else "")
             )
     print_line(f"The table is in {output / 'ablation.md'}, with ablation.json and ablation.svg beside it.")
+    diverged = ", ".join(str(job.folder) for job in ablation.runs if job.diverged)
+    if diverged:
+        remedy = "Delete a folder to train it from the start; the same command tries to go on with it."
+        raise DivergedError(f"{diverged}: diverged, and left out of the table. {remedy}")
 
 
 def kept_checkpoint(run: TrainingRun) -> str:

@@ -6,7 +6,7 @@ import datetime
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -39,7 +39,7 @@ def convert_photographs(
 ) -> tuple[tuple[FootageFrame, ...], tuple[str, ...]]:
     """Write `photos` to the folder `target` as PNG, no side above `max_side` px, turned as their EXIF tag says.
 
-    Times are those of the EXIF tags where all photographs have one and not all are equal, else their numbers; the
+    Times are those of the EXIF tags where all photographs have one that tells them apart, else their numbers; the
     second value names which. Raises `CaptureError` naming a file that cannot be read.
     """
     frames, taken = [], []
@@ -57,9 +57,13 @@ def convert_photographs(
         taken.append(time)
         observe(index + 1, len(photos))
     known = [time for time in taken if time is not None]
-    if len(known) < len(taken) or len(set(known)) < 2:
+    if len(known) < len(taken):
         return tuple(frames), ("the photographs have no times of their own: their order by name is taken as time",)
-    frames = [frame.model_copy(update={"time": t - min(known)}) for frame, t in zip(frames, known, strict=True)]
+    times = [time.seconds for time in known]
+    if len(set(times)) < len(times) and not all(time.with_fraction for time in known):
+        reason = "several photographs have the same EXIF time, which has no fractions of a second"
+        return tuple(frames), (f"{reason}: their order by name is taken as time",)
+    frames = [frame.model_copy(update={"time": t - min(times)}) for frame, t in zip(frames, times, strict=True)]
     return tuple(sorted(frames, key=lambda frame: frame.time)), ("times are those of the EXIF tags",)
 
 
@@ -69,8 +73,15 @@ def image_size(image: Path) -> tuple[int, int]:
     return spec.width, spec.height
 
 
-def _read(photo: Path, max_side: int) -> tuple[oiio.ImageBuf, float | None]:
-    """The upright image at its final size, and its EXIF time in seconds."""
+class ExifTime(NamedTuple):
+    """When a photograph was taken, in seconds, and whether its tags tell fractions of a second."""
+
+    seconds: float
+    with_fraction: bool
+
+
+def _read(photo: Path, max_side: int) -> tuple[oiio.ImageBuf, ExifTime | None]:
+    """The upright image at its final size, and its EXIF time."""
     image = oiio.ImageBuf(str(photo))
     size = image.spec()
     if max(size.width, size.height) > MAX_IMAGE_SIDE or size.width * size.height > MAX_IMAGE_PIXELS:
@@ -87,8 +98,9 @@ def _read(photo: Path, max_side: int) -> tuple[oiio.ImageBuf, float | None]:
     return oiio.ImageBufAlgo.reorient(image), time  # last: it copies the image
 
 
-def _time(spec: oiio.ImageSpec) -> float | None:
-    text = spec.getattribute("Exif:DateTimeOriginal") or spec.getattribute("DateTime")
+def _time(spec: oiio.ImageSpec) -> ExifTime | None:
+    # Not DateTime: of TIFF and PNG it is when the file was written, and OpenImageIO itself writes it.
+    text = spec.getattribute("Exif:DateTimeOriginal")
     if not text:
         return None
     try:
@@ -96,4 +108,6 @@ def _time(spec: oiio.ImageSpec) -> float | None:
     except ValueError:
         return None  # a tag that some programs leave empty or write in words
     fraction = str(spec.getattribute("Exif:SubsecTimeOriginal") or "").strip()
-    return moment.timestamp() + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
+    if not fraction.isdecimal():
+        return ExifTime(moment.timestamp(), with_fraction=False)
+    return ExifTime(moment.timestamp() + float(f"0.{fraction}"), with_fraction=True)

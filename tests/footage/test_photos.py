@@ -66,6 +66,38 @@ def test_times_of_the_exif_tags_order_the_frames(tmp_path: Path) -> None:
     assert "EXIF" in notes[0]
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif", "jpg"])
+def test_when_a_file_was_written_is_no_time_of_its_photograph(tmp_path: Path, suffix: str) -> None:
+    for name, second in (("a", 30), ("b", 10), ("c", 20)):
+        written = f"2026:11:28 10:00:{second}"
+        write(tmp_path / f"{name}.{suffix}", np.full((20, 30, 3), 90, np.uint8), DateTime=written)
+    frames, notes = convert(tmp_path)
+    assert [(frame.name, frame.time) for frame in frames] == [("00000.png", 0), ("00001.png", 1), ("00002.png", 2)]
+    assert "no times of their own" in notes[0]
+
+
+def test_a_burst_within_a_second_is_in_order_of_its_names(tmp_path: Path) -> None:
+    for index in range(4):
+        moment = f"2026:11:28 10:00:0{index // 2}"
+        write(tmp_path / f"{index}.jpg", np.full((20, 30, 3), 90, np.uint8), Exif__DateTimeOriginal=moment)
+    frames, notes = convert(tmp_path)
+    assert [frame.time for frame in frames] == [0, 1, 2, 3]
+    assert "no fractions of a second" in notes[0]
+
+
+def test_fractions_of_a_second_count_and_two_cameras_may_see_the_same_moment(tmp_path: Path) -> None:
+    for name, fraction in (("a1", "50"), ("a2", "25"), ("b1", "5"), ("b2", "25")):
+        tags = {"Exif__DateTimeOriginal": "2026:11:28 10:00:00", "Exif__SubsecTimeOriginal": fraction}
+        write(tmp_path / f"{name}.jpg", np.full((20, 30, 3), 90, np.uint8), **tags)
+    frames, _ = convert(tmp_path)
+    assert [(frame.name, frame.time) for frame in frames] == [
+        ("00001.png", 0),
+        ("00003.png", 0),
+        ("00000.png", 0.25),
+        ("00002.png", 0.25),
+    ]
+
+
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
 def test_the_orientation_tag_is_applied(tmp_path: Path, orientation: int) -> None:
     upright = np.zeros((20, 30, 3), np.uint8)

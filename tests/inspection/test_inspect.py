@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import graings
 from graings.camera.camera import Camera
 from graings.cli.main import app
 from graings.config import CaptureConfig
 from graings.inspection.document import Inspection
 from graings.inspection.inspect import inspect_capture
-from graings.plan.cost import Calibration
+from graings.kernel import usable_cores
+from graings.plan.cost import CALIBRATION_FILE, Calibration, cache_folder
+from graings.report.machine import machine_facts
+from graings.storage.files import write_document
 from tests.capture.captures import (
     entry,
     orbit,
@@ -25,6 +29,23 @@ from tests.capture.captures import (
     write_single,
     write_transforms,
     write_walled,
+)
+
+MADE = Calibration(
+    version=graings.__version__,
+    cpu="x",
+    threads=2,
+    step=0.01,
+    view=0.001,
+    pixel=0.1,
+    gaussian=0.1,
+    gaussian_view=0.1,
+    deformation=0.1,
+    deformation_view=0.1,
+    residual_view=0.1,
+    wall_over_cpu=0.6,
+    error=0.1,
+    cost_s=1.0,
 )
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -145,28 +166,12 @@ def test_masks_that_hide_nearly_everything_are_said(tmp_path: Path) -> None:
 
 
 def test_minutes_are_those_of_the_calibration_and_memory_grows_with_the_images(tmp_path: Path) -> None:
-    calibration = Calibration(
-        version="0",
-        cpu="x",
-        threads=2,
-        step=0.01,
-        view=0.001,
-        pixel=0.1,
-        gaussian=0.1,
-        gaussian_view=0.1,
-        deformation=0.1,
-        deformation_view=0.1,
-        residual_view=0.1,
-        wall_over_cpu=0.6,
-        error=0.1,
-        cost_s=1.0,
-    )
-    small, _ = inspect_capture(write_floor(tmp_path / "small"), None, calibration)
+    small, _ = inspect_capture(write_floor(tmp_path / "small"), None, MADE)
     minutes = [small.forecasts[preset].minutes for preset in ("draft", "standard", "fine")]
     assert all(value is not None and value > 0 for value in minutes)
     assert minutes == sorted(minutes)  # type: ignore[type-var]
     assert "time unknown" in "\n".join(inspect_capture(write_floor(tmp_path / "other"))[0].lines())
-    large, _ = inspect_capture(write_floor(tmp_path / "large", 40), None, calibration)
+    large, _ = inspect_capture(write_floor(tmp_path / "large", 40), None, MADE)
     assert large.forecasts["fine"].memory_mb > small.forecasts["fine"].memory_mb
 
 
@@ -180,3 +185,26 @@ def test_the_command_prints_the_text_or_the_document_and_writes_the_picture(tmp_
     document = json.loads(run.output)
     assert document["schema"] == "graings.inspection/1"
     assert document["statistics"]["width"] == 80
+
+
+def test_the_command_refuses_options_that_it_does_not_read(tmp_path: Path) -> None:
+    folder = write_floor(tmp_path / "floor")
+    run = CliRunner().invoke(app, ["inspect", str(folder), "--set", "iterations=50000"])
+    assert run.exit_code == 2
+    assert "graings plan" in run.output
+
+
+@pytest.mark.parametrize("changed", [{"cpu": "of another machine"}, {"threads": 4_096}])
+def test_the_command_predicts_no_minutes_from_measurements_of_another_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changed: dict[str, object]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    cache_folder().mkdir(parents=True)
+    here = {"cpu": machine_facts().cpu, "threads": usable_cores()}
+    folder, minutes = write_floor(tmp_path / "floor"), []
+    for facts in (here, {**here, **changed}):
+        write_document(cache_folder() / CALIBRATION_FILE, MADE.model_copy(update=facts))
+        run = CliRunner().invoke(app, ["inspect", str(folder), "--json"])
+        minutes.append(json.loads(run.output)["forecasts"]["draft"]["minutes"])
+    assert minutes[0] > 0
+    assert minutes[1] is None
