@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,7 +20,8 @@ class RasterSettings:
     stop (the Gaussian that would cross the threshold is not blended) and a square footprint of three standard
     deviations.
 
-    Raises `ValueError` for values out of range; `alpha_max` is below 1 because the backward pass divides by 1 - alpha.
+    Raises `ValueError` for values out of range; `alpha_max` is below 1, also in float32, because the backward pass
+    divides by 1 - alpha.
     """
 
     alpha_min: float = constants.ALPHA_MIN
@@ -32,7 +34,7 @@ class RasterSettings:
     compat: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.alpha_min < self.alpha_max < 1:
+        if not 0 <= self.alpha_min < self.alpha_max or not np.float32(self.alpha_max) < 1:
             raise ValueError(f"0 <= alpha_min < alpha_max < 1 expected, got {self.alpha_min} and {self.alpha_max}")
         if not 0 <= self.transmittance_min < 1:
             raise ValueError(f"transmittance_min must lie in [0, 1), got {self.transmittance_min}")

@@ -8,6 +8,7 @@
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "perceptron.hpp"
@@ -15,7 +16,21 @@
 namespace nb = nanobind;
 
 template <class T> using In = nb::ndarray<const T, nb::c_contig, nb::device::cpu>;
-template <class T> using Out = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
+// An array that the kernel writes. Unlike an input it is never converted to another type: results would go to a copy.
+template <class T> struct Out : nb::ndarray<T, nb::c_contig, nb::device::cpu> {};
+
+namespace nanobind::detail {
+template <class T> struct type_caster<Out<T>> {
+    using Array = nb::ndarray<T, nb::c_contig, nb::device::cpu>;
+    NB_TYPE_CASTER(Out<T>, make_caster<Array>::Name)
+    bool from_python(handle source, uint8_t flags, cleanup_list* cleanup) noexcept {
+        make_caster<Array> array;
+        if (!array.from_python(source, uint8_t(flags & ~uint8_t(cast_flags::convert)), cleanup)) return false;
+        static_cast<Array&>(value) = std::move(array.value);
+        return true;
+    }
+};
+}  // namespace nanobind::detail
 
 template <class Array>
 auto* checked(const Array& array, size_t size, const char* name) {

@@ -42,7 +42,7 @@ graings::Inputs<R> inputs(int64_t count, Address means, Address quats, Address l
 template <class R>
 graings::Anchors<R> anchors(const In<R>& position, const In<R>& log_scale, const In<R>& offset) {
     const size_t count = position.shape(0), slots = offset.shape(1);
-    return {int64_t(count), int64_t(slots), position.data(), checked(log_scale, 3 * count, "log_scales"), checked(offset, 3 * count * slots, "offsets")};
+    return {int64_t(count), int64_t(slots), checked(position, 3 * count, "position"), checked(log_scale, 3 * count, "log_scales"), checked(offset, 3 * count * slots, "offsets")};
 }
 
 template <class R>

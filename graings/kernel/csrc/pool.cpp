@@ -9,8 +9,10 @@
 #include <mutex>
 #include <thread>
 #include <utility>
-#ifdef __linux__
+#if defined(__unix__) || defined(__APPLE__)
 #include <pthread.h>
+#endif
+#ifdef __linux__
 #include <sched.h>
 #endif
 
@@ -150,9 +152,20 @@ private:
     std::atomic<int64_t> posted_{0};
 };
 
+// Never destroyed: its threads outlive static destruction.
+Pool* current = nullptr;
+
 Pool& pool() {
-    static Pool* forever = new Pool;  // never destroyed: its threads outlive static destruction
-    return *forever;
+    static const bool made = [] {
+        current = new Pool;
+#if defined(__unix__) || defined(__APPLE__)
+        // A child of fork() has the memory of the pool and none of its threads; its lock may be held for ever.
+        pthread_atfork(nullptr, nullptr, [] { current = new Pool; });
+#endif
+        return true;
+    }();
+    static_cast<void>(made);
+    return *current;
 }
 
 }  // namespace
