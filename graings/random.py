@@ -43,6 +43,9 @@ class RandomStreams:
         return {name: generator.get_state() for name, generator in sorted(self._generators.items())}
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Restore the generators to `state`."""
+        """Restore the generators to `state`; a stream that was not used then starts from its beginning."""
+        for name, generator in self._generators.items():
+            if name not in state:
+                generator.manual_seed(stream_seed(self.seed, name))
         for name, tensor in state.items():
             self[name].set_state(tensor)

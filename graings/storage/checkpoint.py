@@ -74,17 +74,18 @@ def save_checkpoint(
     """
     folder = run / CHECKPOINTS
     name = BEST if best else f"{iteration:08d}"
-    final, part = folder / name, folder / f".{name}.part"
+    final, part, old = folder / name, folder / f".{name}.part", folder / f".{name}.old"
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _put_back(folder)
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         save_file(_contiguous(scene.state_dict()), part / _SCENE_FILE)
         save_file(_contiguous(state.tensors), part / _STATE_FILE)
-        digest = hashlib.sha256((part / _SCENE_FILE).read_bytes()).hexdigest()
         facts = {
             "format": FORMAT,
-            "digest": digest,
+            "digest": _digest(part / _SCENE_FILE),
+            "state_digest": _digest(part / _STATE_FILE),
             **model_facts(
                 scene=scene,
                 units=units,
@@ -98,16 +99,15 @@ def save_checkpoint(
         }
         (part / FACTS_FILE).write_text(json.dumps(facts, allow_nan=False))
         sync_tree(part)
-        old = folder / f".{name}.old"
-        shutil.rmtree(old, ignore_errors=True)
         if final.exists():
-            # The same iteration again (the end right after a periodic checkpoint): the new one replaces it.
+            # The best so far, or the same iteration again (the end right after a periodic checkpoint).
             final.rename(old)
         part.rename(final)
         shutil.rmtree(old, ignore_errors=True)
         sync(folder)
     except (OSError, SafetensorError) as error:  # the library has its own for a full disk
         shutil.rmtree(part, ignore_errors=True)
+        _put_back(folder)
         raise CheckpointError(
             f"{final}: cannot write the checkpoint ({error}). Free some space; earlier ones are kept."
         ) from error
@@ -128,14 +128,20 @@ def load_model(path: Path) -> Model:
 
 
 def load_training(path: Path) -> tuple[Model, TrainingState]:
-    """As `load_model`, with what the trainer stored beside the model: both of the same checkpoint."""
+    """As `load_model`, with what the trainer stored beside the model: both of the same checkpoint.
+
+    For the only trainer of a run: it also completes what a process that died left half done.
+    """
+    if (path / CHECKPOINTS).is_dir():
+        _put_back(path / CHECKPOINTS)
     return _newest_readable(path, lambda folder: (_model(folder), load_state(folder)))
 
 
 def load_state(folder: Path) -> TrainingState:
     """What the trainer stored in a checkpoint folder. Raises `CheckpointError`."""
     try:
-        return TrainingState(load_file(folder / _STATE_FILE), _read_facts(folder)["state"])
+        facts = _read_facts(folder)
+        return TrainingState(_tensors(folder / _STATE_FILE, facts["state_digest"]), facts["state"])
     except (OSError, SafetensorError, *DAMAGE) as error:
         raise CheckpointError(
             f"{folder}: damaged training state ({error!r}). Remove this folder; {_REMEDY}."
@@ -145,9 +151,31 @@ def load_state(folder: Path) -> TrainingState:
 def _model(folder: Path) -> Model:
     facts = _read_facts(folder)
     try:
-        return model_from(facts, load_file(folder / _SCENE_FILE), facts["digest"], folder)
+        digest = facts["digest"]
+        return model_from(facts, _tensors(folder / _SCENE_FILE, digest), digest, folder)
     except (OSError, SafetensorError, *DAMAGE) as error:
         raise CheckpointError(f"{folder}: damaged checkpoint ({error!r}). Remove this folder; {_REMEDY}.") from error
+
+
+def _tensors(file: Path, digest: str) -> dict[str, Tensor]:
+    """The tensors in `file`. Raises `ValueError` where they are not those that were written."""
+    if _digest(file) != digest:
+        raise ValueError(f"{file.name} is not what was written")
+    return load_file(file)
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _put_back(folder: Path) -> None:
+    """Rename checkpoints back that were about to be replaced when the process died; remove those that were replaced."""
+    for old in folder.glob(".*.old"):
+        final = folder / old.name[1:].removesuffix(".old")
+        if final.exists():
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            old.rename(final)
 
 
 def _newest_readable(path: Path, read: Callable[[Path], Read]) -> Read:

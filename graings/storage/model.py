@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -15,11 +15,15 @@ from graings.camera.camera import Camera, View
 from graings.camera.sampling_rate import SamplingRate
 from graings.camera.units import Units
 from graings.config import SceneConfig, TrainConfig, restored
+from graings.constants import MAX_IMAGE_SIDE
 from graings.scene.scaffold import Scaffold
 from graings.scene.scene import Scene
 
 # What Python, pydantic and torch raise where facts or tensors are not what they should be.
 DAMAGE: Final = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RuntimeError)
+
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,26 +82,27 @@ def model_from(facts: Mapping[str, Any], tensors: Mapping[str, Tensor], digest: 
     rates = {name: float(value) for name, value in facts["sampling_rate"].items()}
     if not all(0.0 < value < math.inf for value in rates.values()):
         raise ValueError(f"sampling rates must be positive and finite, got {rates}")
+    extent = _finite([tensors["extent"].item()], 1, "extent")[0]
+    if extent <= 0:
+        raise ValueError(f"extent must be positive, got {extent}")
     scene = Scene(
         shape,
         Scaffold(**rows),
-        extent=float(tensors["extent"]),
+        extent=extent,
         sampling=SamplingRate(**rates),
         initial_opacity=0.1,
     )
     scene.load_state_dict(tensors)
-    scene.temporal = facts["temporal"]
-    units = facts["units"]
+    scene.temporal = _exactly(bool, facts["temporal"], "temporal")
+    red, green, blue = _finite(facts["background"], 3, "background")
     return Model(
         scene=scene,
-        units=Units(
-            tuple(units["center"]), units["scale"], units["time_start"], units["time_span"], tuple(units["up"])
-        ),
-        background=tuple(facts["background"]),
+        units=_units_from_json(facts["units"]),
+        background=(red, green, blue),
         views=views,
         config=config,
-        iteration=facts["iteration"],
-        finished=facts["finished"],
+        iteration=_exactly(int, facts["iteration"], "iteration"),
+        finished=_exactly(bool, facts["finished"], "finished"),
         digest=digest,
         path=path,
     )
@@ -115,5 +120,33 @@ def _view_to_json(view: View) -> dict[str, Any]:
 
 
 def _view_from_json(facts: dict[str, Any]) -> View:
-    camera = Camera(np.array(facts["world_to_camera"]), *facts["intrinsics"], *facts["size"])
-    return View(facts["name"], camera, facts["time"])
+    width, height = (_exactly(int, side, "size") for side in facts["size"])
+    if max(width, height) > MAX_IMAGE_SIDE:
+        raise ValueError(f"size must be at most {MAX_IMAGE_SIDE} px, got {width}x{height}")
+    fx, fy, cx, cy = _finite(facts["intrinsics"], 4, "intrinsics")
+    camera = Camera(np.array(facts["world_to_camera"], np.float64), fx, fy, cx, cy, width, height)
+    (time,) = _finite([facts["time"]], 1, "time")
+    return View(_exactly(str, facts["name"], "name"), camera, time)
+
+
+def _units_from_json(facts: dict[str, Any]) -> Units:
+    x, y, z = _finite(facts["center"], 3, "center")
+    up_x, up_y, up_z = _finite(facts["up"], 3, "up")
+    scale, start, span = _finite([facts[name] for name in ("scale", "time_start", "time_span")], 3, "units")
+    if scale <= 0:
+        raise ValueError(f"scale must be positive, got {scale}")
+    return Units((x, y, z), scale, start, span, (up_x, up_y, up_z))
+
+
+def _exactly(kind: type[Value], value: object, name: str) -> Value:
+    if type(value) is not kind:
+        raise TypeError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
+def _finite(values: Sequence[object], count: int, name: str) -> list[float]:
+    """The `count` numbers `values`. Raises `ValueError` for another length, and numbers that are not finite."""
+    numbers = [float(value) for value in values if type(value) in (int, float)]  # type: ignore[arg-type]
+    if len(values) != count or len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{name} must be {count} finite numbers")
+    return numbers
