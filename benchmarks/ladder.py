@@ -46,7 +46,7 @@ ROWS = (
         "appearance",
         "new anchors as opaque as their parent, opacity without the view, view harmonics, residual that sees the view",
         (
-            *("scene.learnable_anchors", "scene.relative_scales"),
+            "scene.relative_scales",
             *("density.new_anchor_opacity", "scene.child_opacity_offsets"),
             *("scene.opacity_view", "scene.residual_stop_gradient"),
             *("scene.color_sh_degree", "scene.reflection", "scene.residual_sh_degree"),

@@ -42,7 +42,6 @@ ADDITIONS = (
     Addition("rigidity", ("loss.rigidity",)),
     Addition("squared_error", ("loss.squared",)),
     Addition("alpha_loss", ("loss.alpha",)),
-    Addition("fixed_anchors", ("scene.learnable_anchors",)),
     Addition("relative_scales", ("scene.relative_scales",)),
     Addition("parent_opacity", ("density.new_anchor_opacity", "scene.child_opacity_offsets")),
     Addition("opacity_without_view", ("scene.opacity_view",)),

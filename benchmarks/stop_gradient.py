@@ -47,9 +47,7 @@ def position_gradient(run: TrainingRun, frame: Frame, stop: bool) -> Tensor:
     """Gradient [A, 3] of L_pho of one view with respect to the anchors' positions, float64."""
     scene, config = run.trainer.scene, run.trainer.scene.config
     anchors = scene.scaffold.anchors
-    learned = anchors.requires_grad
     scene.config = config.model_copy(update={"stop_gradient": stop})
-    anchors.requires_grad_()
     try:
         composition = scene.compose(frame.camera.center, frame.time)
         result = draw(composition, frame.camera, run.trainer.background)
@@ -57,7 +55,6 @@ def position_gradient(run: TrainingRun, frame: Frame, stop: bool) -> Tensor:
         (gradient,) = torch.autograd.grad(loss, anchors)
     finally:
         scene.config = config
-        anchors.requires_grad_(learned)
     return gradient.double()
 
 

@@ -13,6 +13,7 @@ from graings import constants
 from graings.config import TrainConfig, make_config
 from graings.config.schedule import phases
 from graings.scene.children import MAX_LOG_SCALE_OFFSET
+from tests.models import tiny_scene
 
 SETUP: Final = "IV-A Implementation Details"
 OBJECTIVE: Final = "III-E Training Objectives and Schedule"
@@ -37,7 +38,6 @@ PRINTED: Final[tuple[tuple[str, str, str, Any], ...]] = (
     ("no opacity pruning in the first 80 % of the joint phase", SETUP, "density.prune_from", 3_000 + 0.8 * 27_000),
     ("nor where a budget is nearly used up: there is none", SETUP, "density.max_anchors", None),
     ("every candidate in a free voxel becomes an anchor", SCAFFOLD, "density.max_growth", None),
-    ("Eq. 3: a learnable tuple, x_a included", SCAFFOLD, "scene.learnable_anchors", True),
     ("Eq. 5: rho_can is StaticMLP's alone", SCAFFOLD, "scene.relative_scales", False),
     ("Eq. 5: a StaticMLP", SCAFFOLD, "scene.canonical", True),
     ("new anchors start with low opacity", SCAFFOLD, "density.new_anchor_opacity", 0.1),
@@ -65,8 +65,11 @@ PRINTED: Final[tuple[tuple[str, str, str, Any], ...]] = (
     ("no part left out for a scene", OBJECTIVE, "plan.mode", "off"),
 )
 
-# What is printed, its section, the constant of the code, and its value.
-CONSTANTS: Final[tuple[tuple[str, str, float, float], ...]] = (
+# What is printed, its section, what the code has, and what it should be.
+TUPLE: Final = {"anchors", "log_scales", "features"}
+LEARNED: Final = {name for name, _ in tiny_scene().scaffold.named_parameters()}
+CONSTANTS: Final[tuple[tuple[str, str, Any, Any], ...]] = (
+    ("Eq. 3: a learnable tuple, x_a included", SCAFFOLD, LEARNED & TUPLE, TUPLE),
     ("alpha is at most", APPEARANCE, constants.ALPHA_MAX, 0.99),
     ("Eq. 10: bound of the clip of Delta rho", DEFORMATION, MAX_LOG_SCALE_OFFSET, 2.0),
 )
@@ -121,7 +124,7 @@ def test_the_preset_has_what_is_printed(what: str, section: str, name: str, valu
 
 
 @pytest.mark.parametrize(("what", "section", "found", "value"), CONSTANTS, ids=[row[0] for row in CONSTANTS])
-def test_the_code_has_what_is_printed(what: str, section: str, found: float, value: float) -> None:
+def test_the_code_has_what_is_printed(what: str, section: str, found: Any, value: Any) -> None:
     assert found == value, f"{section}: {what}"
 
 

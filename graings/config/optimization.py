@@ -77,8 +77,7 @@ class RatesConfig(ConfigSection):
     log_scales: FirstAndLast = Field((0.007, 0.003), description="log s_a of the anchors.")
     anchors: FirstAndLast = Field(
         (6e-4, 6e-6),
-        description="Anchor positions with `scene.learnable_anchors`, in units of the scene's extent; as those of "
-        "positions in 3DGS.",
+        description="Anchor positions, in units of the scene's extent; as those of positions in 3DGS.",
     )
     opacity_offsets: FirstAndLast = Field(
         (0.02, 0.002), description="Offsets of the opacity logits of an anchor's children."

@@ -57,7 +57,6 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
             "time_frequencies": 6,
             "residual_scale": 0.1,
             "time_conditioning": "concatenated",
-            "learnable_anchors": True,
             "relative_scales": False,
             "residual_sh_degree": 0,
             "residual_stop_gradient": False,

@@ -97,11 +97,6 @@ class SceneConfig(ConfigSection):
         description="child: one deformation per Gaussian (the paper's method); anchor: one per anchor, shared by its "
         "children; none: a static scene.",
     )
-    learnable_anchors: bool = Field(
-        False,
-        description="Learn the anchor positions x_a, as in Eq. 3. false: they stay on the voxel grid, and the offsets "
-        "of the children adapt alone.",
-    )
     relative_scales: bool = Field(
         True,
         description="Log-scales from StaticMLP are relative to log s_a, the size of the anchor. false: rho_can is "

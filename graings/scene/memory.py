@@ -27,10 +27,10 @@ BOTH_WAYS: Final = 2
 def bytes_per_anchor(config: SceneConfig, views: int) -> int:
     """Memory in bytes of one more anchor whose children are all drawn, with `views` per step."""
     k = config.children
-    rows = 3 + config.feature_dim + 3 * k + 1
+    rows = 6 + config.feature_dim + 3 * k + 1
     statistics = 16 * k + 16
-    # Positions and uids are kept as they are; growth and pruning hold old and new rows at once.
-    fixed = 20 * (1 + COPIES) + statistics * 4
+    # Uids are kept as they are; growth and pruning hold old and new rows at once.
+    fixed = 8 * (1 + COPIES) + statistics * 4
     static = 3 + k + config.static_width
     deform = encoding_width(3, config.position_frequencies) + config.deform_width * config.deform_depth
     direction = (2 if config.reflection else 1) * direction_width(config.color_sh_degree)

@@ -10,16 +10,14 @@ from torch import Tensor, nn
 class Scaffold(nn.Module):
     """A anchors with k child slots each.
 
-    `anchors` [A, 3] and `uids` [A] are buffers: anchors stay on the voxel grid on which they were created, and the
-    child offsets adapt the positions. After `learn_anchors`, `anchors` is a parameter. Parameters: `log_scales` [A, 3]
-    (log s_a, normalised units), `features` [A, d_f], `offsets` [A, k, 3] (epsilon of Eq. 4, in units of s_a),
-    `opacity_offsets` [A] or [A, k] (added inside the tanh of Eq. 11, so that a new anchor can start with low opacity
-    although it inherits its parent's features). Raises `ValueError` where these have another shape.
+    Parameters: `anchors` [A, 3] (x_a, normalised units), `log_scales` [A, 3] (log s_a), `features` [A, d_f], `offsets`
+    [A, k, 3] (epsilon of Eq. 4, in units of s_a), `opacity_offsets` [A] or [A, k] (added inside the tanh of Eq. 11, so
+    that a new anchor can start with low opacity although it inherits its parent's features). `uids` [A] is a buffer.
+    Raises `ValueError` where these have another shape.
     """
 
     ROWS = ("anchors", "uids", "log_scales", "features", "offsets", "opacity_offsets")  # tensors with a row per anchor
 
-    anchors: Tensor
     uids: Tensor
 
     def __init__(
@@ -33,23 +31,25 @@ class Scaffold(nn.Module):
     ) -> None:
         super().__init__()
         count = anchors.shape[0]
-        self.register_buffer("anchors", anchors)
-        self.register_buffer("uids", torch.arange(count) if uids is None else uids)
+        opacity_offsets = anchors.new_zeros(count) if opacity_offsets is None else opacity_offsets
+        uids = torch.arange(count) if uids is None else uids
+        slots = offsets.shape[1] if offsets.dim() == 3 else 0
+        for name, tensor, shapes in (
+            ("anchors", anchors, [(count, 3)]),
+            ("log_scales", log_scales, [(count, 3)]),
+            ("features", features, [(count, features.shape[-1])]),
+            ("offsets", offsets, [(count, slots, 3)]),
+            ("opacity_offsets", opacity_offsets, [(count,), (count, slots)]),
+            ("uids", uids, [(count,)]),
+        ):
+            if tuple(tensor.shape) not in shapes:
+                raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {tuple(tensor.shape)}")
+        self.register_buffer("uids", uids)
+        self.anchors = nn.Parameter(anchors)
         self.log_scales = nn.Parameter(log_scales)
         self.features = nn.Parameter(features)
         self.offsets = nn.Parameter(offsets)
-        opacity_offsets = anchors.new_zeros(count) if opacity_offsets is None else opacity_offsets
-        if tuple(opacity_offsets.shape) not in {(count,), tuple(offsets.shape[:2])}:
-            raise ValueError(
-                f"opacity_offsets must have a row for each anchor, not shape {tuple(opacity_offsets.shape)}"
-            )
         self.opacity_offsets = nn.Parameter(opacity_offsets)
-
-    def learn_anchors(self) -> None:
-        """Make the anchor positions a parameter, as in Eq. 3."""
-        positions = self.anchors.detach()
-        del self.anchors
-        self.anchors = nn.Parameter(positions)
 
     @property
     def slot_opacity_offsets(self) -> Float[Tensor, "anchor own"]:

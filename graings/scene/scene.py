@@ -76,13 +76,15 @@ class Scene(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        shape = (scaffold.features.shape[1], scaffold.slots)
+        if shape != (config.feature_dim, config.children):
+            wanted = f"features of {config.feature_dim} numbers and {config.children} children"
+            raise ValueError(f"anchors must have {wanted}, got {shape[0]} and {shape[1]}")
         self.config = config
         self.scaffold = scaffold
         self.register_buffer("extent", torch.tensor(float(extent), dtype=scaffold.features.dtype))
         self.sampling = sampling
         self.temporal = False
-        if config.learnable_anchors:
-            scaffold.learn_anchors()
         # Of the networks' log-scales: that of each anchor, or one for all.
         self.log_unit = None if config.relative_scales or not config.canonical else math.log(float(self.extent))
         initial_log_scale = math.log(INITIAL_SCALE)

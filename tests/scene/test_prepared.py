@@ -44,7 +44,7 @@ CONFIGS: list[dict[str, Any]] = [
     {"opacity_view": True},
     {"child_opacity_offsets": True},
     {"child_opacity_offsets": True, "opacity_view": True},
-    {"relative_scales": False, "learnable_anchors": True},
+    {"relative_scales": False},
     {"relative_scales": False, "time_conditioning": "concatenated"},
     {"projected_clip": False, "children": 1},
     {"head_width": 33, "deform_width": 40, "deform_depth": 1, "children": 7},
