@@ -40,8 +40,8 @@ from graings.training.training_log import TrainingLog
 class TrainingRun:
     """One run folder being trained. Make it with `create` or `resume`.
 
-    It computes with `threads` CPU threads (None: those of `config`) while it is made and iterated over; the settings
-    of the process are as before afterwards.
+    It computes with `threads` CPU threads (None: those of `config`) while it makes its first scene and is iterated;
+    the settings of the process are as before afterwards.
     """
 
     def __init__(
@@ -252,11 +252,11 @@ class TrainingRun:
             found = MissingMotion.find(trainer.scene, self.capture, self.images, self.applied)
         if found is None or (found.tracks is None and trainer.window.share(1) < 1):
             return ()
-        event = found.event(self.iteration)
         self.revision.begin_again()
         self._start(RestartState(self.iteration, found.time_window, found.tracks is not None), found.tracks)
-        self.log.note([event])
-        return (event,)
+        self._trainer.guard.restarted(trainer.guard)
+        self.log.note(events := (found.event(self.iteration),))
+        return events
 
     def _save(self, **how: bool) -> Path:
         return self.output.save(self._trainer, self._restart, self.iteration, **how)

@@ -144,6 +144,7 @@ class RunOutput:
                 state = load_state(best)
                 trainer.adopt(load_model(best).scene, state.tensors, state.facts["trainer"], guard)
                 self.log.gaussians = int(state.facts["gaussians"])
+        self.log.forget_after(trainer.run_iteration)
 
     def save(
         self,

@@ -11,7 +11,8 @@ from graings.report.events import Event
 class StepReport:
     """One step.
 
-    `psnr` in dB is the mean over the training views of the step; `gaussians` is the number drawn in any of them.
+    `psnr` in dB is the mean over the training views of the step; `gaussians` is the number that any of them
+    may show: with an opacity score above 1/255, also outside of the image.
     `seconds` are wall time, `cpu_s` CPU time of all threads of the process.
     """
 

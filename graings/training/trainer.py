@@ -61,6 +61,8 @@ class Trainer(TrainerState):
         phase = self.phase(self.iteration)
         self.scene.temporal = phase.temporal
         self._set_sampling_rate(self.pyramid.at(self.iteration).sampling)
+        if self.window.stage(self.iteration) != self.window.stage(self.iteration - 1):
+            self.guard.trend.begin()  # losses of more times do not compare
         events: list[Event] = self._initial_events() if self.iteration == 1 else []
 
         # sample views
@@ -257,6 +259,8 @@ class Trainer(TrainerState):
         self.guard.rolled_back(before)
         self.guard.rollbacks += 1
         self._set_sampling_rate(self.pyramid.at(self.iteration).sampling)
+        if self.window.stage(self.iteration) != self.window.stage(snapshot.iteration):
+            self.guard.trend.begin()
         self.collapse.raised = raised
         self._slow_down()
         self._restart_views()

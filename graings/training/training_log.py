@@ -17,7 +17,7 @@ from graings.document import Document
 from graings.evaluation.metrics import SplitMetrics
 from graings.plan.plan import Plan
 from graings.report.curve import curve_figure
-from graings.report.events import Event, Stiff
+from graings.report.events import Event, RolledBack, Stiff
 from graings.report.figure_files import svg
 from graings.report.folder import report_training
 from graings.report.machine import machine_facts, version_facts
@@ -147,6 +147,10 @@ class TrainingLog:
         self.curve = [point for point in self.curve if point.iteration < iteration]
         self.events = [one for one in self.events if not (isinstance(one, Stiff) and one.iteration == iteration)]
 
+    def forget_after(self, iteration: int) -> None:
+        """Take back the points of the curve beyond `iteration`, to which training has returned."""
+        self.curve = [point for point in self.curve if point.iteration <= iteration]
+
     def write_run(self) -> None:
         """Write run.json: what is trained, on which capture and with which versions."""
         with self.clock.timed("report"):
@@ -202,7 +206,7 @@ class TrainingLog:
                 capture=self._capture_facts(background),
                 skipped_steps=guard.skipped,
                 clipped_steps=guard.clipped,
-                rollbacks=guard.rollbacks,
+                rollbacks=sum(isinstance(event, RolledBack) for event in self.events),
                 stiffness=None if stiffness is None else _facts(stiffness),
                 diverged=self.diverged is not None,
                 diverged_reason=self.diverged,

@@ -104,6 +104,8 @@ def test_a_diverged_run_can_be_resumed_at_its_low_rates_and_finishes(
     assert list(again)[-1].iteration == 90
     document = _document(folder)
     assert (document["diverged"], document["rollbacks"], document["skipped_steps"]) == (False, 3, 12)
+    iterations = [point["iteration"] for point in document["curve"]]
+    assert iterations == sorted(set(iterations))
     assert load_model(folder).finished
 
 

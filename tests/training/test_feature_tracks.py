@@ -171,6 +171,23 @@ def test_a_frame_that_sees_no_point_has_no_moving_features(crossed: Path) -> Non
     assert len(moving.between(0, 1).start) == 0
 
 
+def test_a_dense_cloud_gives_the_same_depths_in_little_memory(crossed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = load_capture(crossed)
+    camera = capture.train[0].camera
+    pixels = np.random.default_rng(0).random((200_000, 2)) * [camera.width, camera.height]
+    ahead = np.stack([(pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy], axis=1)
+    depth = 2.0 + 0.5 * pixels[:, :1] / camera.width
+    cloud = np.concatenate([ahead * depth, depth], axis=1) @ camera.world_to_camera[:3, :3] + camera.center
+    sizes: list[int] = []
+    cdist = torch.cdist
+    monkeypatch.setattr(torch, "cdist", lambda a, b: sizes.append(len(b)) or cdist(a, b))
+    moving = MovingFeatures(capture.train[:2], images(), cloud)
+    depths = moving._depths(0)
+    columns = (np.arange(depths.shape[1]) + 0.5) / depths.shape[1]
+    np.testing.assert_allclose(depths, np.broadcast_to(2.0 + 0.5 * columns, depths.shape), atol=0.02)
+    assert sizes == [10_000]
+
+
 def test_the_shift_of_points_is_a_part_of_the_image() -> None:
     one = Camera(np.eye(4), 100.0, 100.0, 50.0, 25.0, 100, 50)
     pose = np.eye(4)

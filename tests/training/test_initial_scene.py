@@ -26,7 +26,7 @@ from graings.training.initialization.initial_scene import (
     make_scene,
 )
 from graings.training.initialization.triangulation import triangulate
-from tests.capture.captures import FOV, write_walled
+from tests.capture.captures import FOV, write_image, write_walled
 from tests.training.micro import GROWING, events_of, micro_trainer, quality, steps
 
 WHITE = (1.0, 1.0, 1.0)
@@ -110,6 +110,18 @@ def test_cameras_that_look_outwards_get_triangulated_points(tmp_path: Path) -> N
     capture = load_capture(write_walled(tmp_path, cameras))
     assert any("look outwards" in note for note in capture.notes)
     assert [event.source for event in _first(capture).notes] == ["triangulation"]
+
+
+@pytest.mark.parametrize("masked", [0, 20, 40])
+def test_masked_pixels_do_not_make_a_room_an_object_before_a_background(
+    filled: Capture, tmp_path: Path, masked: int
+) -> None:
+    mask = np.full((64, 64, 1), 255, np.uint8)
+    mask[:, :masked] = 0
+    file = write_image(tmp_path / "mask.png", mask)
+    train = tuple(replace(frame, mask_path=file) for frame in filled.train)
+    notes = _first(replace(filled, train=train)).notes
+    assert notes[0].triangulated is not None  # it was tried, however few points are left
 
 
 def test_random_points_can_be_requested(filled: Capture) -> None:

@@ -75,7 +75,10 @@ UNTRACKED = {"scene.single_mlp": True}
 def test_a_missing_ball_restarts_training_with_tracks_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_floored(tmp_path / "c", monkeypatch)
     run = TrainingRun.create(capture, tmp_path / "run", small())
-    reports = train(run, LATER)
+    reports = train(run, MIN_STEPS - 1)
+    run._trainer.guard.skipped, run._trainer.guard.clipped = 3, 5
+    reports += train(run, LATER)
+    assert (run._trainer.guard.skipped, run._trainer.guard.clipped) == (3, 5)
     (restart,) = [event for r in reports for event in r.events if event.kind == "restart"]
     assert (restart.iteration, restart.time_window) == (MIN_STEPS, 1.0)
     assert "points that follow what moves" in restart.message

@@ -32,6 +32,32 @@ def test_a_window_narrower_than_the_frame_interval_keeps_the_middle_view() -> No
     assert [window.has(view, 0) for view in range(3)] == [False, True, False]
 
 
+def test_losses_are_compared_within_a_stage_of_the_window_only(micro: Path) -> None:
+    trainer = micro_trainer(micro, iterations=600, time_window=0.3, **{"guard.patience": 20})
+    steps(trainer, 60)
+    worse = 0
+    for _ in range(300):
+        before = trainer.window.stage(trainer.iteration)
+        trainer.guard.trend.add(10.0)  # what a view of a new time would do
+        trainer.step()
+        changed = trainer.window.stage(trainer.iteration) != before
+        worse += not changed
+        assert not changed or trainer.guard.trend.above == 0
+        assert not changed or trainer.guard.trend.mean < 1.0
+    assert 200 < worse < 300
+    assert trainer.window.stage(trainer.iteration) == 20
+
+
+def test_a_rollback_to_another_stage_compares_no_losses_with_it(micro: Path) -> None:
+    trainer = micro_trainer(micro, iterations=600, time_window=0.3)
+    steps(trainer, 20)
+    assert trainer.guard.trend.mean is not None
+    trainer._take_snapshot()
+    trainer.iteration = 590
+    trainer._roll_back("a test")
+    assert trainer.guard.trend.mean is None
+
+
 def test_views_outside_the_window_are_not_used_until_it_is_wide(micro: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = micro_trainer(micro, iterations=60, time_window=0.3)
     drawn: list[float] = []

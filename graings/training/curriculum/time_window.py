@@ -7,8 +7,11 @@ gradient any more. Within a short window it stays in place.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 from graings.config import TrainConfig
+
+STAGES: Final = 20
 
 
 class TimeWindow:
@@ -30,6 +33,10 @@ class TimeWindow:
             return self.first
         progress = (iteration - self._from) / max(1, self._until - self._from)
         return min(1.0, self.first + (1.0 - self.first) * progress)
+
+    def stage(self, iteration: int) -> int:
+        """Which of `STAGES` of the window `iteration` belongs to: losses of different stages do not compare."""
+        return int(self.share(iteration) * STAGES)
 
     def has(self, view: int, iteration: int) -> bool:
         """Whether `view` is used at `iteration`."""

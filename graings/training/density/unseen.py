@@ -26,7 +26,7 @@ def drop_unseen(trainer: Trainer, log: TrainingLog) -> tuple[Event, ...]:
     """Remove every anchor whose children each contribute less than `density.unseen_pixels` to each training view.
 
     A scene of which nothing is seen stays as it is. Where anchors go, the log's number of Gaussians becomes that of as
-    many training views as a step has, spread evenly. Returns what happened.
+    many training views as a step has, chosen by the hash of their names. Returns what happened.
     """
     least = log.config.density.unseen_pixels
     if least == 0:

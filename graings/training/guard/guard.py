@@ -54,7 +54,8 @@ class StepCheck:
 class Guard:
     """Checks steps and keeps the statistics that the next checks need.
 
-    `skipped`, `clipped` and `rollbacks` count events of the whole run, also those that a rollback undid.
+    `skipped` and `clipped` count steps of the whole run, also those that a rollback undid; `rollbacks` are those since
+    the run began or was restarted.
     """
 
     def __init__(self, config: GuardConfig) -> None:
@@ -109,6 +110,10 @@ class Guard:
         """This guard was restored from a snapshot; take over the counts of the guard `before` the rollback."""
         self.skipped, self.clipped, self.rollbacks = before.skipped, before.clipped, before.rollbacks
         self.consecutive, self._recent = 0, []
+
+    def restarted(self, before: Guard) -> None:
+        """This guard watches a new scene of the run that the guard `before` watched; take over its counts."""
+        self.skipped, self.clipped = before.skipped, before.clipped
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Everything the next check depends on: norms by group, and plain numbers."""

@@ -44,7 +44,7 @@ SEEN: Final = 2 * constants.ALPHA_MIN
 class Stiffness:
     """kappa_step and f_sub at one iteration; None where nothing was measured or drawn.
 
-    `views` is how many training views `subpixel_share` looked at.
+    `views` is how many views `subpixel_share` looked at: held-out ones along the curve, training views at the end.
     """
 
     step_over_size: float | None

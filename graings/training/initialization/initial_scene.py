@@ -143,7 +143,8 @@ def initial_points(capture: Capture, images: ImageStore, config: TrainConfig, st
     whole = _masked_views(capture, images, config, order, 1.0)
     check_not_empty(whole)  # within a part of the clip all objects may be out of view
     notes: tuple[PointsInitialized, ...] = ()
-    if np.mean([view.mask.mean() for view in whole]) > FILLED:
+    filled = [view.filled for view in whole if view.filled is not None]
+    if filled and np.mean(filled) > FILLED:
         places, note = _triangulated(capture, images)
         notes = (note,)
         if places is not None:

@@ -56,6 +56,13 @@ class MaskedFrame:
     opaque: bool
     valid: NDArray[np.bool_] | None = None
 
+    @property
+    def filled(self) -> float | None:
+        """Share of the valid pixels that the mask fills; None where no pixel is valid."""
+        if self.valid is None:
+            return float(self.mask.mean())
+        return float(self.mask[self.valid].mean()) if self.valid.any() else None
+
 
 def masked(frames: Sequence[Frame], images: ImageStore, background: Sequence[float]) -> list[MaskedFrame]:
     """The masks of `frames`: opaque pixels that do not have the background colour."""

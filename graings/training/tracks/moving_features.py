@@ -32,6 +32,8 @@ MIN_SHIFT: Final = 0.005
 # Resting points whose median inverse depth a place of the image gets, and such places along the longer side.
 NEAREST: Final = 8
 PLACES: Final = 64
+# Of more resting points a random sample gives the depths: they are compared with every place.
+MAX_REST: Final = 10_000
 
 # A feature belongs to something that moves if it moves like so many moving features around it, up to this part of
 # their median displacement. Wrong matches do not.
@@ -65,7 +67,8 @@ class MovingFeatures:
         self.frames = [reduced(frame, SIDE) for frame in whole]
         self.rest = rest
         self._features = lru_cache(KEPT)(lambda frame: extract([self.frames[frame]], images)[0])
-        self._depths = lru_cache(KEPT)(lambda frame: _depths(self.frames[frame].camera, rest))
+        sparse = rest if len(rest) <= MAX_REST else np.random.default_rng(0).choice(rest, MAX_REST, replace=False)
+        self._depths = lru_cache(KEPT)(lambda frame: _depths(self.frames[frame].camera, sparse))
 
     def between(self, one: int, other: int) -> FeatureMotion:
         """The moving features that two frames share. Raises `ImportError` without pycolmap."""
