@@ -23,6 +23,7 @@ import torch
 
 from graings import kernel
 from graings.camera.camera import View
+from graings.evaluation.metrics import MSE_FLOOR
 from graings.render import render
 from graings.scene.motion_basis import MotionBasis
 from graings.scene.prepared import PreparedScene
@@ -33,7 +34,7 @@ ROUNDS = 30
 
 
 def difference(model: Model, one: PreparedScene, other: PreparedScene, views: Sequence[View]) -> tuple[float, float]:
-    """PSNR in dB and largest difference in grey levels of two scenes."""
+    """PSNR in dB, at most 100, and largest difference in grey levels of two scenes."""
     squares, largest = [], 0.0
     for number, view in enumerate(views):
         moment = (number * 0.6180339887498949) % 1.0
@@ -42,7 +43,7 @@ def difference(model: Model, one: PreparedScene, other: PreparedScene, views: Se
         squares.append(float(change.square().mean()))
         largest = max(largest, 255 * float(change.abs().max()))
     mean = statistics.mean(squares)
-    return (-10 * math.log10(mean) if mean else math.inf), largest
+    return -10 * math.log10(max(mean, MSE_FLOOR)), largest
 
 
 def cpu_ms(call: Callable[[float], Any]) -> float:

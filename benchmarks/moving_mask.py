@@ -78,6 +78,9 @@ def main() -> None:
     print("| run | views | PSNR, SSIM | on what moves |\n|---|---|---|---|")
     for run in args.runs:
         whole, inside = measured(run, args.split, polygons)
+        if whole.psnr is None or inside.psnr is None or whole.ssim_3dgs is None or inside.ssim_3dgs is None:
+            print(f"| {run.name} | 0 | no view of {args.split} shows what moves | |")
+            continue
         print(
             f"| {run.name} | {len(whole.views)} | {whole.psnr:.2f}, {whole.ssim_3dgs:.4f} "
             f"| {inside.psnr:.2f}, {inside.ssim_3dgs:.4f} |"

@@ -12,11 +12,16 @@ from graings.training.run import TrainingRun
 
 
 def finished(folder: Path) -> Metrics | None:
-    """Metrics of the last iteration; None before it."""
+    """Metrics of the last iteration; None before it. Raises `SystemExit` where the run diverged."""
     if not (folder / METRICS_FILE).exists():
         return None
     metrics = read_metrics(folder / METRICS_FILE)
-    return metrics if "val" in metrics.splits else None
+    if metrics.diverged:
+        raise SystemExit(
+            f"{folder}: diverged ({metrics.diverged_reason}). Look at it, and delete it to train it again."
+        )
+    ended = metrics.iterations >= metrics.iterations_planned  # an interrupted run may have been evaluated
+    return metrics if ended and "val" in metrics.splits else None
 
 
 def train(folder: Path, capture: Path, config: TrainConfig) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import statistics
 from pathlib import Path
+from typing import Any
 
 import torch
 from scaling import write_scaling
@@ -63,7 +64,12 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=None)
     parser.add_argument("--steps", type=int, default=40)
     options = parser.parse_args()
+    with kernel.computing_threads(options.threads):
+        write_scaling(options.output, "step_scaling", measured(options))
 
+
+def measured(options: argparse.Namespace) -> dict[str, Any]:
+    """The document of the measurements."""
     by_count = dict(milliseconds(trainer_of(options, share, None), options.steps) for share in FRACTIONS)
     by_pixels: dict[int, dict[str, float]] = {}
     for side in SIDES:
@@ -72,14 +78,13 @@ def main() -> None:
         by_pixels[camera.width * camera.height] = milliseconds(trainer, options.steps)[1]
     views = trainer.config.batch
     series = {"Gaussians drawn": by_count, "pixels of an image": by_pixels}
-    document = {
+    return {
         "title": f"What one training step of {views} views costs",
         "isa": kernel.active_isa(),
         "threads": kernel.thread_count(),
         "views": views,
         "series": {title: {str(size): row for size, row in rows.items()} for title, rows in series.items()},
     }
-    write_scaling(options.output, "step_scaling", document)
 
 
 if __name__ == "__main__":

@@ -26,14 +26,18 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+from runs import check, finished
 
 from graings.camera.viewpoint import sized
 from graings.capture.synthetic import SUITE
 from graings.capture.synthetic.drawing import draw
 from graings.capture.synthetic.viewpoint import on_path
+from graings.cli.training import setting
+from graings.config import make_config
 from graings.image_encoding import encode_image
 from graings.render import render
 from graings.storage.checkpoint import load_model
+from graings.storage.run_folder import RECORD_FILE
 
 TIMES = (0.1, 0.45, 0.8)
 GALLERY_TIMES = (0.05, 0.25, 0.45, 0.65, 0.85)
@@ -56,6 +60,8 @@ def generate(folder: Path, names: Sequence[str], size: int, views: int) -> dict[
     for name in names:
         target = folder / name
         if name in numbers and (target / "transforms_train.json").is_file():
+            if numbers[name].get("views", views) != views:
+                raise SystemExit(f"{target}: has {numbers[name]['views']:.0f} views. Give another folder for {views}.")
             continue
         shutil.rmtree(target, ignore_errors=True)
         before, started = cpu_seconds(), time.perf_counter()
@@ -64,6 +70,7 @@ def generate(folder: Path, names: Sequence[str], size: int, views: int) -> dict[
         files = [file for file in target.rglob("*") if file.is_file()]
         images = [file for file in files if file.suffix == ".png" and "moving" not in file.parts]
         numbers[name] = {
+            "views": views,
             "images": len(images),
             "cpu_s": cpu,
             "wall_s": wall,
@@ -79,8 +86,11 @@ def train(folder: Path, name: str, preset: str, extra: Sequence[str]) -> dict[st
     """The metrics document of the finished and evaluated run."""
     run = folder / "runs" / f"{name}-{preset}"
     metrics = run / "metrics.json"
+    if (run / RECORD_FILE).is_file():
+        options = dict(setting(part) for part in extra if part != "--set")
+        check(run, folder / name, make_config(preset, options))
     splits = ("test",) if name == "still" else ("test", "between")
-    if not metrics.is_file() or "val" not in json.loads(metrics.read_text())["splits"]:
+    if finished(run) is None:
         if any(run.glob("checkpoints/*")) or any(run.glob("*.safetensors")):
             graings("train", "--resume", "-o", run)
         else:

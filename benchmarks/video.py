@@ -57,7 +57,8 @@ def main() -> None:
             of_render = cpu_ms(rendered, len(frames))
             gaussians = len(shown.scene.compose(camera.center, 0.5).gaussians)
             for suffix in (*FORMATS, ""):
-                path = Path(folder) / f"video{suffix}"
+                path = Path(folder) / run.name / f"video{suffix}"
+                path.parent.mkdir(exist_ok=True)
 
                 def encoded() -> None:
                     files = [path] if path.suffix else [Path(folder) / f"{k}.png" for k in range(len(levels))]  # noqa: B023

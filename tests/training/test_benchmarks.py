@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import importlib
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 
+from graings.capture.images import ImageStore
+from graings.capture.load import load_capture
+from graings.capture.synthetic.catalogue import scene_named
+from graings.capture.synthetic.drawing import draw
+from graings.capture.synthetic.planned_view import planned_views
+from graings.config import CaptureConfig
+from graings.storage.files import write_document
+from graings.storage.run_folder import METRICS_FILE
 from tests.training.micro import micro_config
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -90,3 +100,39 @@ def test_published_numbers_stand_beside_their_own_protocol(scripts: Any) -> None
         protocol = tables.PROTOCOLS[name]
         assert sum(protocol.published.values()) / 7 == pytest.approx(mean, abs=0.006)
         assert name == f"{protocol.background}-{protocol.max_side}"
+
+
+def test_a_run_is_finished_only_with_the_metrics_of_its_last_iteration(
+    scripts: Any, micro: Path, tmp_path: Path
+) -> None:
+    runs, folder = scripts("runs"), tmp_path / "run"
+    runs.train(folder, micro, micro_config(iterations=4))
+    metrics = runs.finished(folder)
+    assert metrics.iterations == 4
+    interrupted = metrics.model_copy(update={"iterations_planned": 9})  # and evaluated
+    write_document(folder / METRICS_FILE, interrupted)
+    assert runs.finished(folder) is None
+    diverged = metrics.model_copy(update={"diverged": True, "diverged_reason": "the loss"})
+    write_document(folder / METRICS_FILE, diverged)
+    with pytest.raises(SystemExit, match="the loss"):
+        runs.finished(folder)
+
+
+def test_nothing_moves_in_any_split_of_the_resting_rig(scripts: Any, tmp_path: Path) -> None:
+    """Held-out views had times of the moving scene: no model at rest could have more than 17 dB on most of them."""
+    capture = load_capture(scripts("plan_regret").resting(tmp_path / "rig", 24, 24), CaptureConfig(background="white"))
+    world = scene_named("rig").build(0)
+    images = ImageStore((1.0, 1.0, 1.0))
+    planned = planned_views(world, size=24, views=24, seed=0)
+    for split, frames in (("train", capture.train), ("val", capture.val), ("test", capture.test)):
+        assert len(frames) == len(planned[split])
+        for view, frame in zip(planned[split], frames, strict=True):
+            rgba = draw(world, view.viewpoint, 0.0).rgba / 255.0
+            still = 0.1 + 0.8 * (rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:])
+            assert np.abs(images.rgb(frame) - still).mean() < 0.02, frame.name
+
+
+def test_the_quantiles_of_students_t_fall_to_that_of_the_normal(scripts: Any) -> None:
+    quantiles = scripts("plan_regret").T_95
+    assert quantiles[0] == 12.706
+    assert all(a > b > 1.96 for a, b in pairwise(quantiles))
