@@ -48,7 +48,7 @@ ROWS = (
         (
             "scene.relative_scales",
             *("density.new_anchor_opacity", "scene.child_opacity_offsets"),
-            *("scene.opacity_view", "scene.residual_stop_gradient"),
+            "scene.opacity_view",
             *("scene.color_sh_degree", "scene.reflection", "scene.residual_sh_degree"),
         ),
     ),

@@ -45,7 +45,6 @@ ADDITIONS = (
     Addition("relative_scales", ("scene.relative_scales",)),
     Addition("parent_opacity", ("density.new_anchor_opacity", "scene.child_opacity_offsets")),
     Addition("opacity_without_view", ("scene.opacity_view",)),
-    Addition("residual_detached", ("scene.residual_stop_gradient",)),
     Addition("view_harmonics", ("scene.color_sh_degree",)),
     Addition("reflection", ("scene.reflection",)),
     Addition("residual_view", ("scene.residual_sh_degree",)),

@@ -59,7 +59,6 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
             "time_conditioning": "concatenated",
             "relative_scales": False,
             "residual_sh_degree": 0,
-            "residual_stop_gradient": False,
             "color_sh_degree": 1,
             "reflection": False,
             "opacity_view": True,

@@ -115,9 +115,6 @@ class SceneConfig(ConfigSection):
         description="Highest degree of the spherical harmonics of the viewing direction that the colour residual "
         "receives; 0: none, as in Eq. 12.",
     )
-    residual_stop_gradient: bool = Field(
-        True, description="Stop the gradient from the residual network to the anchor feature."
-    )
     canonical: bool = Field(True, description="false, as an ablation: no network of canonical geometry and no warm-up.")
     color_sh_degree: int = Field(
         3,

@@ -132,12 +132,11 @@ class Scene(nn.Module):
         canonical_opacities = self._canonical_opacities(directions)
         candidates = _candidate_anchors(canonical_opacities, 0.0 if residual_field is None else residual_field.scale)
         features = scaffold.features.index_select(0, candidates)
-        residual_features = features.detach() if config.residual_stop_gradient else features
         opacities = [score.index_select(0, candidates) for score in canonical_opacities]
         directions = [direction.index_select(0, candidates) for direction in directions]
         residuals: list[Tensor | None] = [None] * len(views)
         if residual_field is not None:
-            residual_part = residual_field.part(residual_features)
+            residual_part = residual_field.part(features)
             residuals = [
                 residual_field(residual_part, torch.tensor([time], dtype=features.dtype), direction)
                 for time, direction in zip(times, directions, strict=True)

@@ -62,16 +62,6 @@ def test_deformation_sends_no_gradient_to_the_scaffold() -> None:
     assert scene.deformation.out.weight.grad is not None
 
 
-def test_residual_sends_no_gradient_to_the_features_unless_configured() -> None:
-    for stop, expected in ((True, None), (False, torch.Tensor)):
-        scene = tiny_scene(residual_stop_gradient=stop)
-        residual = scene.compose(EYE, 0.4).residual
-        assert residual is not None
-        residual.square().sum().backward()
-        grad = scene.scaffold.features.grad
-        assert grad is None if expected is None else grad is not None
-
-
 def test_static_scene_evaluates_no_temporal_module() -> None:
     scene = tiny_scene(temporal=False)
     composition = scene.compose(EYE, 0.4)
