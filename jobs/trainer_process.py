@@ -153,10 +153,15 @@ def _train(folder: JobFolder, threads: int, stop: threading.Event) -> int:
 
 
 def _extend(run: Path, iterations: int) -> None:
-    """Let a run that was extended go on; its rates decay as those of a run of the new length."""
+    """Let a run that was extended go on; its rates decay as those of a run of the new length.
+
+    What only the beginning of a training has does not come again: reduced images, a part of the clip, and the look for
+    missing objects, after which training might start anew.
+    """
     record = read_record(run)
     if record.config.iterations < iterations:
-        longer = record.config.model_copy(update={"iterations": iterations})
+        done = {"low_resolution_until": 0, "time_window": 1.0, "time_window_until": 0}
+        longer = record.config.model_copy(update={"iterations": iterations, **done})
         write_document(run / RECORD_FILE, record.model_copy(update={"config": longer}))
 
 

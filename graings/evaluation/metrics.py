@@ -46,7 +46,7 @@ class ViewMetrics(Document):
 
     name: str = Field(description="File name of the photograph, relative to the capture.")
     time: float = Field(description="Normalised time of the view in [0, 1].")
-    psnr: float = Field(le=PSNR_CAP, description="Peak signal-to-noise ratio in dB; 100 for equal images.")
+    psnr: float = Field(le=PSNR_CAP, description="Peak signal-to-noise ratio in dB, at most 100.")
     ssim_3dgs: float = Field(ge=-1, le=1, description="Structural similarity as 3D Gaussian Splatting computes it.")
     lpips_vgg: float | None = Field(description="LPIPS distance with VGG weights; null where it was not measured.")
     flip_ldr: float | None = Field(description="Mean LDR-FLIP error in [0, 1]; null where it was not measured.")
@@ -66,7 +66,7 @@ class SplitMeans(Document):
     flip_ldr: float | None = Field(description="Mean over views of LDR-FLIP; null where any view has none.")
     flip_reason: str | None = Field(description="Why `flip_ldr` is null; null where it is not.")
     saturated: bool = Field(
-        description="Whether some image equals its photograph to the last bit: its PSNR is then the cap of 100 dB."
+        description="Whether the PSNR of some image is the cap of 100 dB: it has a dozen wrong values at most."
     )
     reason: str | None = Field(None, description="Why all means are null; null where they are not.")
 

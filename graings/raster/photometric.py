@@ -40,8 +40,10 @@ def photometric(
 ) -> Float[Tensor, ""]:
     """(1 - w) |image - target|_1 + w (1 - SSIM) + q (image - target)^2, means over pixels and channels.
 
-    w is `ssim_weight`, q `squared_weight`; without q it is Eq. 15. With `valid` the means are over its pixels, and the
-    others change neither value nor gradient (`graings.raster.masking`). Other arguments and errors are those of `ssim`.
+    w is `ssim_weight`, q `squared_weight`; without q it is Eq. 15. With `valid` the differences are means over its
+    pixels, and the others change neither value nor gradient. Of 1 - SSIM all windows that reach a valid pixel are
+    summed, divided by the number of valid pixels, so that small valid parts count more (`graings.raster.masking`).
+    Other arguments and errors are those of `ssim`.
     """
     if valid is not None:
         image, target, share = without_masked(image, target, valid)

@@ -15,6 +15,7 @@ from graings.capture.synthetic import write_synthetic
 from graings.config import make_config
 from graings.storage.checkpoint import load_model
 from graings.storage.locks import locked
+from graings.training.run import TrainingRun
 from jobs.exit_code import ExitCode
 from jobs.job import JobSpec
 from jobs.progress import last_progress, read_progress
@@ -137,7 +138,8 @@ def test_a_job_whose_trainer_was_killed_after_its_last_step_ends_with_a_report_o
 
 
 def test_an_extended_job_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
-    folder = job(Store(tmp_path), {"iterations": 12})
+    begins = {"low_resolution_until": 15_000, "time_window": 0.3, "time_window_until": 30_000}
+    folder = job(Store(tmp_path), {"iterations": 12, **begins})
     folder.begin_attempt("worker")
     with trainer(folder) as process:
         assert process.wait(60) == ExitCode.DONE
@@ -152,3 +154,7 @@ def test_an_extended_job_goes_on_from_its_last_checkpoint(tmp_path: Path) -> Non
     assert last.phase_s["loading"] > reports[0].phase_s.get("loading", 0.0)
     assert set(last.phase_s) >= {"loading", last.phase}
     assert json.loads(folder.metrics.read_text())["iterations"] == 22
+    trainer_ = TrainingRun.resume(folder.run)._trainer
+    for iteration in (13, 22):
+        assert trainer_.window.share(iteration) == 1.0
+        assert trainer_.pyramid.at(iteration).factor == 1

@@ -43,7 +43,7 @@ def test_a_restarted_run_is_loaded_with_the_sampling_rate_of_its_training(
     assert model.scene.sampling == open_model(tmp_path / "scene.graings").scene.sampling == in_training
 
 
-def test_resuming_reads_no_image_before_the_next_step(micro: Path, tmp_path: Path) -> None:
+def test_resuming_does_not_look_for_the_first_points_again(micro: Path, tmp_path: Path) -> None:
     """Initial points are in the checkpoint: finding them again takes up to half a minute and may find others."""
     run = TrainingRun.create(micro, tmp_path / "run", micro_config())
     assert run.images.cached_bytes > 0
