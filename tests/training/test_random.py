@@ -32,3 +32,14 @@ def test_every_view_is_drawn_once_per_round_in_a_new_order() -> None:
     rounds = [[sampler.next() for _ in range(7)] for _ in range(3)]
     assert all(sorted(order) == list(range(7)) for order in rounds)
     assert rounds[0] != rounds[1]
+
+
+def test_a_stream_that_was_not_used_by_then_begins_again_after_a_load() -> None:
+    streams = RandomStreams(3)
+    torch.rand(2, generator=streams["early"])
+    state = streams.state()
+    expected = torch.rand(4, generator=RandomStreams(3)["late"])
+    held = streams["late"]
+    torch.rand(7, generator=held)
+    streams.load(state)
+    assert torch.equal(torch.rand(4, generator=held), expected)
