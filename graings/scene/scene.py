@@ -60,7 +60,8 @@ class Scene(nn.Module):
     Without `temporal` (static warm-up, or a capture of one instant) no time-conditioned module is evaluated.
     `extent` is the half-size of the content in normalised units; positions enter the networks divided by it. `sampling`
     is the sampling rate of the training views: the low-pass filter is part of the trained model and has the same size
-    on the scene in every image. `seed` seeds the initial weights of the networks.
+    on the scene in every image. `seed` seeds the initial weights of the networks. Raises `ValueError` for anchors that
+    have other features or children than `config` says.
     """
 
     extent: Tensor
