@@ -39,8 +39,8 @@ ROWS = (
     Row("time", "time conditioning factorized", ("scene.time_conditioning",)),
     Row(
         "losses",
-        "rigidity, squared error after growth, alpha loss",
-        ("loss.rigidity", "loss.squared", "loss.alpha"),
+        "L_temp a mean over time, rigidity, squared error after growth, alpha loss",
+        ("loss.temporal_sum", "loss.rigidity", "loss.squared", "loss.alpha"),
     ),
     Row(
         "appearance",

@@ -38,6 +38,7 @@ class Addition:
 
 ADDITIONS = (
     Addition(FULL, ()),
+    Addition("temporal_mean", ("loss.temporal_sum",)),
     Addition("rigidity", ("loss.rigidity",)),
     Addition("squared_error", ("loss.squared",)),
     Addition("alpha_loss", ("loss.alpha",)),

@@ -71,6 +71,7 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
         "loss": {
             "ssim": 0.2,
             "temporal": 0.01,
+            "temporal_sum": True,
             "deformation": 0.001,
             "residual": 0.01,
             "squared": 0.0,

@@ -202,6 +202,11 @@ class LossConfig(ConfigSection):
         "in the paper: without it surfaces of the background's colour may have holes, and empty space may be opaque.",
     )
     temporal: float = Field(0.01, ge=0, description="lambda_1: temporal smoothness of the deformed positions.")
+    temporal_sum: bool = Field(
+        False,
+        description="Estimate the sum of the temporal term over all pairs of neighbouring training times, as in "
+        "Eq. 16, rather than its mean over them.",
+    )
     deformation: float = Field(0.001, ge=0, description="lambda_2: magnitude of the deformation.")
     residual: float = Field(0.01, ge=0, description="lambda_3: magnitude of the appearance residual.")
     rigidity: float = Field(

@@ -39,18 +39,19 @@ def regularisers(
 ) -> Float[Tensor, ""]:
     """lambda_1 L_temp + lambda_2 L_def + lambda_3 L_res of one step's `compositions`, and rigidity between them.
 
-    Zero in the static phase. The views were composed together at the times `moments`; L_temp is estimated from the
-    first of them and one neighbouring training time per step. `times` are the capture's training times, ascending. Of
-    `streams`, time_pairs samples the neighbour and the children, child_pairs the pairs of the rigidity term.
+    Zero in the static phase. The views were composed together at the times `moments`; L_temp uses the first of them
+    and one neighbouring training time per step. `times` are the capture's training times, ascending. Of `streams`,
+    time_pairs samples the neighbour and the children, child_pairs the pairs of the rigidity term.
     """
     total = torch.zeros(())
     first = compositions[0]
     if len(first.children) == 0:
         return total
     if first.deformation is not None and config.temporal > 0 and len(times) > 1:
+        # The sampled pair stands for all pairs, or for their mean.
+        pairs = len(times) - 1 if config.temporal_sum else 1
         share, generator = config.temporal_share, streams["time_pairs"]
-        pair = _temporal(scene, first, moments[0], times, share, generator)
-        total = total + config.temporal * (len(times) - 1) * pair  # it stands for all pairs
+        total = total + config.temporal * pairs * _temporal(scene, first, moments[0], times, share, generator)
     if config.rigidity > 0:
         total = total + config.rigidity * _rigidity(compositions, float(scene.extent), streams["child_pairs"])
     for one in compositions:
