@@ -19,10 +19,10 @@ from graings.export.formats import read_splats
 from graings.render import render
 from graings.scene.prepared import PreparedScene
 from graings.storage import compact
-from graings.storage.checkpoint import TrainingState, load_model, load_state, load_training, save_checkpoint
+from graings.storage.checkpoint import load_model, load_state, load_training
 from graings.storage.compact import read_compact, write_compact
-from graings.storage.model import Model
 from tests.export.models import tiny_model
+from tests.storage.checkpoints import save
 
 STRANGE = (None, True, -1, 0, 1.5, 10**400, "x", "x" * 9_000, "\ud800", [], {}, [[]], [None], 2**63, 1e308)
 
@@ -131,7 +131,7 @@ def test_tensors_of_another_shape_are_refused(tmp_path: Path, name: str) -> None
         if isinstance(old, torch.nn.Parameter):
             new = torch.nn.Parameter(new)
         setattr(owner, name, new)
-        folder = checkpoint_of(model, tmp_path / f"{name}{new.shape}")
+        folder = save(model, tmp_path / f"{name}{new.shape}")
         with pytest.raises(CheckpointError, match="damaged checkpoint"):
             load_model(folder)
 
@@ -141,33 +141,19 @@ def test_an_extent_that_no_scene_has_is_refused(tmp_path: Path, extent: float) -
     model = tiny_model()
     model.scene.extent.fill_(extent)
     with pytest.raises(CheckpointError, match="extent"):
-        load_model(checkpoint_of(model, tmp_path))
+        load_model(save(model, tmp_path))
 
 
 @pytest.mark.parametrize("file", ["scene.safetensors", "state.safetensors"])
 def test_a_flipped_bit_is_noticed_and_an_earlier_checkpoint_is_used(tmp_path: Path, file: str) -> None:
     model = tiny_model()
-    earlier, newer = (checkpoint_of(model, tmp_path, iteration) for iteration in (7, 8))
+    earlier, newer = (save(model, tmp_path, iteration) for iteration in (7, 8))
     damaged = bytearray((newer / file).read_bytes())
     damaged[-3] ^= 1
     (newer / file).write_bytes(damaged)
     assert load_training(tmp_path)[0].path == earlier
     with pytest.raises(CheckpointError, match="damaged"):
         load_training(newer)
-
-
-def checkpoint_of(model: Model, folder: Path, iteration: int = 7) -> Path:
-    return save_checkpoint(
-        folder,
-        scene=model.scene,
-        state=TrainingState({"moments": torch.ones(3)}, {"rates": [0.1]}),
-        units=model.units,
-        background=model.background,
-        views=model.views,
-        config=model.config,
-        iteration=iteration,
-        finished=True,
-    )
 
 
 def test_a_bomb_is_refused_before_it_fills_the_memory(
@@ -181,7 +167,7 @@ def test_a_bomb_is_refused_before_it_fills_the_memory(
 
 
 def test_any_value_of_any_fact_of_a_checkpoint_is_rendered_or_refused(tmp_path: Path) -> None:
-    folder = checkpoint_of(tiny_model(), tmp_path)
+    folder = save(tiny_model(), tmp_path)
     file = folder / "checkpoint.json"
     facts = json.loads(file.read_text())
     contents = [json.dumps({**facts, key: value}) for key in facts for value in STRANGE]
