@@ -77,7 +77,10 @@ async function list() {
     if (first) choose(first.id);
     else show(null);
   } else if (jobs.has(current)) {
-    show(jobs.get(current));
+    const job = jobs.get(current);
+    show(job);
+    // A stream that is refused, as with too many requests, does not come back by itself; nor does that of a job that has ended.
+    if (stream?.readyState === EventSource.CLOSED && ["queued", "running"].includes(job.state)) follow(current);
   }
 }
 

@@ -76,6 +76,20 @@ def test_what_could_not_be_fetched_once_is_fetched_again(idle: IdleService, open
     assert page.locator(".message").text_content() == ""
 
 
+def test_a_stream_of_events_that_is_refused_is_opened_again(idle: IdleService, open_page: OpenPage) -> None:
+    refused: list[str] = []
+    page = open_page(idle.url, may_fail="/events")
+
+    def refuse(route: Any) -> None:
+        refused.append(route.request.url)
+        route.fulfill(status=429, content_type="application/json", body=json.dumps({"detail": "Too many requests."}))
+
+    page.route("**/events", refuse, times=1)
+    with page.expect_response(lambda answer: answer.url.endswith("/events") and answer.ok, timeout=20_000):
+        idle.submit("walker")
+    assert len(refused) == 1
+
+
 def shared(idle: IdleService, job: str) -> str:
     """What a link to the job adds to the address of the page."""
     answer = httpx2.post(f"{idle.url}/jobs/{job}/links").json()
