@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from graings.config import TrainConfig
+from graings.errors import GraingsError
 from graings.report.metrics_document import Metrics, read_metrics
 from graings.report.run_record import read_record
 from graings.storage.run_folder import METRICS_FILE, RECORD_FILE
@@ -27,18 +28,21 @@ def finished(folder: Path) -> Metrics | None:
 def train(folder: Path, capture: Path, config: TrainConfig) -> None:
     """Train a run to its end, or resume it; nothing where it is finished.
 
-    Raises `SystemExit` where the run in `folder` is of another capture or has other options: its numbers would be
-    taken for those that were asked for.
+    Raises `SystemExit` with the reason where it cannot be trained, as when the capture is broken, and where the run in
+    `folder` is of another capture or has other options: its numbers would be taken for those that were asked for.
     """
     begun = (folder / RECORD_FILE).exists()
     if begun:
         check(folder, capture, config)
     if finished(folder) is not None:
         return
-    run = TrainingRun.resume(folder) if begun else TrainingRun.create(capture, folder, config)
-    for report in run:
-        if report.evaluation is not None:
-            print(f"{folder.name}  {report.iteration:,}  {report.evaluation.psnr:.2f} dB", flush=True)
+    try:
+        run = TrainingRun.resume(folder) if begun else TrainingRun.create(capture, folder, config)
+        for report in run:
+            if report.evaluation is not None:
+                print(f"{folder.name}  {report.iteration:,}  {report.evaluation.psnr:.2f} dB", flush=True)
+    except GraingsError as error:
+        raise SystemExit(f"{folder}: {error}") from error
 
 
 def check(folder: Path, capture: Path, config: TrainConfig) -> None:

@@ -75,6 +75,11 @@ def test_an_addition_that_the_preset_lacks_has_no_row(scripts: Any, tmp_path: Pa
         assert any("reflection" in line for line in lines)
 
 
+def test_a_capture_that_cannot_be_trained_is_named_in_one_line(scripts: Any, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="no_capture"):
+        scripts("runs").train(tmp_path / "run", tmp_path / "no_capture", micro_config())
+
+
 @pytest.mark.slow(reason="a training with its report")
 def test_a_run_is_finished_once_and_refused_with_other_options(scripts: Any, micro: Path, tmp_path: Path) -> None:
     runs = scripts("runs")
