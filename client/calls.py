@@ -42,9 +42,12 @@ def settings(url: str, key: str | None) -> dict[str, Any]:
 
 
 def read(response: httpx2.Response, how: Callable[[httpx2.Response], T]) -> T:
-    """The answer of the service. Raises `RefusedError`."""
+    """The answer of the service. Raises `RefusedError`, and `ClientError` where another program answers."""
     if response.is_success:
-        return how(response)
+        try:
+            return how(response)
+        except (ValueError, TypeError, LookupError) as error:  # such as a page that asks for a password
+            raise ClientError(f"{response.url} answers, but not as this service does. Is its address right?") from error
     try:
         problem = response.json()
     except ValueError:  # from a proxy in between
@@ -80,7 +83,9 @@ def submit(
 
 def job_name(name: str | None, capture: Path | str) -> str:
     """The name of a job: that of its capture unless another is given, as long as the service takes it."""
-    return (name or Path(capture).resolve().stem)[:NAME_LENGTH]
+    path = Path(capture).resolve()
+    title = path.name if path.is_dir() else path.stem.removesuffix(".tar")
+    return (name or title)[:NAME_LENGTH]
 
 
 def begin_upload(size: int, how: Query | None = None) -> Call[dict[str, Any]]:
@@ -164,7 +169,7 @@ def page(path: str) -> Call[tuple[list[RemoteJob], str | None]]:
 def render(job_id: str | None, query: Query) -> Call[bytes]:
     """The parameters of an image; lists become JSON for `pose` and numbers with commas for `target`."""
     given = {name: _text(name, value) for name, value in query.items() if value is not None}
-    return Call("GET", "/render", _content, given if job_id is None else {"job": job_id, **given})
+    return Call("GET", "/render", _image, given if job_id is None else {"job": job_id, **given})
 
 
 def with_format(view: Query, path: Path | str | None) -> Query:
@@ -217,6 +222,12 @@ def _page(response: httpx2.Response) -> tuple[list[RemoteJob], str | None]:
 
 
 def _content(response: httpx2.Response) -> bytes:
+    return response.content
+
+
+def _image(response: httpx2.Response) -> bytes:
+    if not response.headers.get("content-type", "").startswith("image/"):
+        raise ValueError("not an image")
     return response.content
 
 

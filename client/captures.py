@@ -42,10 +42,21 @@ def packed(capture: Path | str) -> Iterator[Path]:
         target = Path(folder) / "capture.zip"
         # Images are compressed already, and a time before 1980, which zip cannot store, matters to nobody.
         with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, strict_timestamps=False) as archive:
-            for path in sorted(source.rglob("*")):
-                if path.is_file():
-                    archive.write(path, path.relative_to(source))
+            for path in _files(source, frozenset()):
+                archive.write(path, path.relative_to(source))
         yield target
+
+
+def _files(folder: Path, above: frozenset[Path]) -> Iterator[Path]:
+    """All files of a folder in order of their names, also of linked folders; `above` are those that it lies in."""
+    real = folder.resolve()
+    if real in above:
+        raise ClientError(f"{folder}: is a link to a folder that it lies in. Remove it.")
+    for path in sorted(folder.iterdir()):
+        if path.is_dir():
+            yield from _files(path, above | {real})
+        elif path.is_file():
+            yield path
 
 
 def chunks(archive: Path, observe: Observe | None, start: int, end: int) -> Iterator[bytes]:

@@ -57,7 +57,7 @@ class VideoSpec(Document):
         "or nerfstudio's camera_path (docs/export.md). Default: orbit, or views if all training views are on one side.",
     )
     seconds: float = Field(4.0, gt=0, le=600, description="Length.")
-    fps: float = Field(30.0, gt=0, le=240, description="Frames per second.")
+    fps: float = Field(30.0, ge=0.1, le=240, description="Frames per second.")
     t: float | None = Field(None, ge=0, le=1, description="Time while only the camera moves (default: 0).")
     camera: str | None = Field(None, max_length=40, description="A view of the capture: train:0, val:3, test:12.")
     azimuth: float | None = Field(None, description="Orbit: degrees about the vertical at the start.")

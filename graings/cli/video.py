@@ -14,7 +14,7 @@ from graings.cli.terminal import print_line, task_progress
 from graings.cli.training import Threads
 from graings.export.camera_path import Moves, frames_of
 from graings.export.shown import open_shown
-from graings.export.video import FPS, check_video, video_size, write_video
+from graings.export.video import FPS, MIN_FPS, check_video, video_size, write_video
 from graings.export.video_parts import FRAMES
 from graings.kernel import use_threads
 
@@ -33,7 +33,7 @@ def video(
         ),
     ] = None,
     seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="Length.")] = 4.0,
-    fps: Annotated[float, typer.Option(min=0.1, max=FPS, help="Frames per second; at most 100 in a .gif.")] = 30.0,
+    fps: Annotated[float, typer.Option(min=MIN_FPS, max=FPS, help="Frames per second; at most 100 in a .gif.")] = 30.0,
     t: Annotated[float | None, typer.Option(help="Time from 0 to 1 while only the camera moves (default: 0).")] = None,
     camera: Annotated[
         str | None, typer.Option(help="A view of the capture for a fixed camera, such as test:3.")

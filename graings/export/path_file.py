@@ -93,6 +93,8 @@ def _number(name: str, key: str, value: Any) -> float:
 
 def _nerfstudio(document: dict[str, Any], shown: Shown, request: ViewRequest) -> list[PathKey]:
     """Every frame of a camera_path.json: camera_to_world (4x4, OpenGL axes) and the vertical field of view."""
+    if (kind := document.get("camera_type", "perspective")) != "perspective":
+        raise ValueError(f"camera_type must be perspective, got {kind!r:.40}")
     sides = ("render_width", "render_height")
     width, height = (int(_number("camera_path", side, document.get(side))) for side in sides)
     if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:

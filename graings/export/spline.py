@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graings.camera.camera import Camera
+from graings.camera.viewpoint import sized
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,15 +24,17 @@ class PathKey:
 def spline(keys: Sequence[PathKey], count: int, *, closed: bool = False) -> list[PathKey]:
     """`count` cameras along a Catmull-Rom spline through `keys`, at equal distances of the parameter.
 
-    Positions, rotations (projected onto the nearest rotation), log focal lengths and times are interpolated; the image
-    size is that of the first key. A closed spline returns to its first key without repeating it.
+    Positions, rotations (projected onto the nearest rotation), log focal lengths and times are interpolated, times
+    linearly; the image size is that of the first key, and keys of another shape keep their horizontal field of view.
+    A closed spline returns to its first key without repeating it, and so do its times.
     """
     poses = [np.linalg.inv(key.camera.world_to_camera) for key in keys]
     size = keys[0].camera
     lenses = [_lens(key.camera, size) for key in keys]
     rows = np.stack([np.concatenate([p[:3].ravel(), lens]) for p, lens in zip(poses, lenses, strict=True)])
     timed = all(key.time is not None for key in keys)
-    times = np.array([key.time for key in keys], dtype=np.float64) if timed else None
+    moments = [*keys, keys[0]] if closed else keys
+    times = np.array([key.time for key in moments], dtype=np.float64) if timed else None
     segments = len(keys) if closed else len(keys) - 1
     found = []
     for index in range(count):
@@ -43,14 +46,14 @@ def spline(keys: Sequence[PathKey], count: int, *, closed: bool = False) -> list
         pose[:3, 3] = -pose[:3, :3] @ row[:12].reshape(3, 4)[:, 3]
         fx, fy = np.exp(row[12:14])
         camera = Camera(pose, float(fx), float(fy), float(row[14]), float(row[15]), size.width, size.height)
-        moment = None if times is None else float(np.interp(place, np.arange(len(keys)), times))
+        moment = None if times is None else float(np.interp(place, np.arange(len(moments)), times))
         found.append(PathKey(camera, moment))
     return found
 
 
 def _lens(camera: Camera, size: Camera) -> NDArray[np.float64]:
     """Log focal lengths and principal point at the image size of `size`."""
-    camera = camera.resized(size.width, size.height)
+    camera = sized(camera, size.width, size.height)
     return np.array([math.log(camera.fx), math.log(camera.fy), camera.cx, camera.cy])
 
 

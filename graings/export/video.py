@@ -19,7 +19,8 @@ from graings.export.video_parts import open_parts
 from graings.render import render
 
 FORMATS: Final = (".mp4", ".webm", ".webp", ".gif")
-FPS: Final = 240.0  # most frames per second
+MIN_FPS: Final = 0.1  # frames per second
+FPS: Final = 240.0
 
 
 def check_video(path: Path, fps: float) -> None:
@@ -29,9 +30,9 @@ def check_video(path: Path, fps: float) -> None:
         known = f"{', '.join(FORMATS)}, or no suffix: a folder of PNG files"
         raise ValueError(f"{path.name}: videos of this kind are not written, choose one of {known}")
     most = MAX_FPS.get(suffix, FPS)
-    if not 0 < fps <= most:
+    if not MIN_FPS <= fps <= most:
         of = f" for a {suffix} file" if suffix in MAX_FPS else ""
-        raise ValueError(f"fps must lie in (0, {most:g}]{of}, got {fps:g}")
+        raise ValueError(f"fps must lie in [{MIN_FPS:g}, {most:g}]{of}, got {fps:g}")
 
 
 def video_size(path: Path, camera: Camera) -> tuple[int, int]:

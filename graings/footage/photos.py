@@ -60,7 +60,10 @@ def convert_photographs(
     if len(known) < len(taken):
         return tuple(frames), ("the photographs have no times of their own: their order by name is taken as time",)
     times = [time.seconds for time in known]
-    if len(set(times)) < len(times) and not all(time.with_fraction for time in known):
+    told_apart = len(set(times)) == len(times)
+    # Two cameras may see the same moment; but a fraction that is the same everywhere, as "00", tells nothing.
+    fractions = {time.fraction for time in known}
+    if not told_apart and (None in fractions or len(fractions) == 1):
         reason = "several photographs have the same EXIF time, which has no fractions of a second"
         return tuple(frames), (f"{reason}: their order by name is taken as time",)
     frames = [frame.model_copy(update={"time": t - min(times)}) for frame, t in zip(frames, times, strict=True)]
@@ -74,10 +77,10 @@ def image_size(image: Path) -> tuple[int, int]:
 
 
 class ExifTime(NamedTuple):
-    """When a photograph was taken, in seconds, and whether its tags tell fractions of a second."""
+    """When a photograph was taken, in seconds, and the fraction of a second in its tags, if they have one."""
 
     seconds: float
-    with_fraction: bool
+    fraction: float | None
 
 
 def _read(photo: Path, max_side: int) -> tuple[oiio.ImageBuf, ExifTime | None]:
@@ -107,7 +110,6 @@ def _time(spec: oiio.ImageSpec) -> ExifTime | None:
         moment = datetime.datetime.strptime(str(text), "%Y:%m:%d %H:%M:%S").replace(tzinfo=datetime.UTC)
     except ValueError:
         return None  # a tag that some programs leave empty or write in words
-    fraction = str(spec.getattribute("Exif:SubsecTimeOriginal") or "").strip()
-    if not fraction.isdecimal():
-        return ExifTime(moment.timestamp(), with_fraction=False)
-    return ExifTime(moment.timestamp() + float(f"0.{fraction}"), with_fraction=True)
+    digits = str(spec.getattribute("Exif:SubsecTimeOriginal") or "").strip()
+    fraction = float(f"0.{digits}") if digits.isdecimal() else None
+    return ExifTime(moment.timestamp() + (fraction or 0.0), fraction)

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 # Transfer functions of HDR video (ITU-T H.273): PQ and HLG. Shown as SDR they are grey and flat.
 HDR_TRANSFERS: Final = {16: "PQ", 18: "HLG"}
 
+# A video that names no colour matrix (2 in ITU-T H.273) has that of Rec. 709 if it is higher than PAL, as in players.
+UNSPECIFIED: Final = 2
+PAL_HEIGHT: Final = 576
+
 PNG_LEVEL: Final = 1
 
 # Of an interval: a frame exactly at its start must not fall into the one before.
@@ -125,7 +129,10 @@ def _write(candidate: _Candidate, target: Path, index: int, max_side: int, aspec
     shown = frame.width * aspect
     scale = min(1.0, max_side / max(shown, frame.height))
     width, height = max(1, round(shown * scale)), max(1, round(frame.height * scale))
-    pixels = frame.reformat(width=width, height=height, format="rgb24", interpolation="AREA").to_ndarray()
+    untagged = frame.colorspace == UNSPECIFIED
+    matrix = "ITU709" if untagged and frame.height > PAL_HEIGHT else None  # None: Rec. 601 unless the video says more
+    shape = {"width": width, "height": height, "format": "rgb24", "interpolation": "AREA"}
+    pixels = frame.reformat(**shape, src_colorspace=matrix).to_ndarray()
     upright = np.rot90(pixels, k=round(frame.rotation / 90) % 4)
     name = f"{index:05d}.png"
     content = encode_image(upright.astype(np.float32) / 255, "png", png_level=PNG_LEVEL)

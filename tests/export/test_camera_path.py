@@ -101,6 +101,18 @@ def test_a_spline_passes_through_its_keys() -> None:
         assert found[3 * index].time == pytest.approx(key.time)
     closed = spline(keys, 8, closed=True)
     np.testing.assert_allclose(closed[6].camera.world_to_camera, keys[3].camera.world_to_camera, atol=1e-9)
+    assert [key.time for key in closed] == pytest.approx([0.0, 0.1, 0.2, 0.55, 0.9, 0.95, 1.0, 0.5])
+
+
+def test_a_spline_through_views_of_different_shapes_keeps_pixels_square() -> None:
+    wide, high, square = ((80, 60), (60, 80), (70, 70))
+    cameras = [
+        replace(camera, fx=90.0, fy=90.0, cx=0.5 * width, cy=0.5 * height, width=width, height=height)
+        for camera, (width, height) in zip(ring(3), (wide, high, square), strict=True)
+    ]
+    for key in spline([PathKey(camera, None) for camera in cameras], 13):
+        assert (key.camera.width, key.camera.height) == wide
+        assert key.camera.fy == pytest.approx(key.camera.fx)
 
 
 def test_a_file_of_keys_may_name_views_orbits_and_times(tmp_path: Path) -> None:
@@ -200,6 +212,7 @@ def test_a_value_of_null_in_a_key_stands_for_the_default(tmp_path: Path) -> None
         (nerfstudio(render_time=math.inf), "render_time"),
         (nerfstudio(render_time="late"), "render_time"),
         (nerfstudio(fov="wide"), "fov must be a finite number"),
+        (json.dumps(json.loads(nerfstudio()) | {"camera_type": "equirectangular"}), "camera_type must be perspective"),
         (nerfstudio(fov=180), r"camera_path\[0\]: fov must lie between"),
         (nerfstudio(camera_to_world=[0.0] * 16), r"camera_path\[0\]: camera_to_world is no pose"),
         (nerfstudio(camera_to_world={"a": 1}), r"camera_path\[0\]: camera_to_world is no pose"),

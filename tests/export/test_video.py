@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -235,14 +236,15 @@ def test_wrong_requests_are_refused(tmp_path: Path) -> None:
         check_video(Path("a.avi"), 30.0)
     with pytest.raises(ValueError, match=r"\.mp4, \.webm"):
         check_video(Path("a.mkv"), 30.0)
-    with pytest.raises(ValueError, match="fps"):
-        write_video(tmp_path / "a.mp4", tiny_shown(), path_of(2), WHITE, fps=0)
+    for fps in (0, 4e-4, 0.099, -1, math.nan, math.inf):  # a rate of 4e-4 would be rounded to none
+        with pytest.raises(ValueError, match="fps"):
+            write_video(tmp_path / "a.mp4", tiny_shown(), path_of(2), WHITE, fps=fps)
 
 
 @pytest.mark.parametrize("fps", [100.01, 101.0, 240.0])
 def test_a_rate_that_gif_does_not_have_is_refused_before_any_work(fps: float, tmp_path: Path) -> None:
     seen: list[int] = []
-    with pytest.raises(ValueError, match=r"fps must lie in \(0, 100\] for a \.gif file"):
+    with pytest.raises(ValueError, match=r"fps must lie in \[0\.1, 100\] for a \.gif file"):
         write_video(tmp_path / "a.gif", tiny_shown(), path_of(3), WHITE, fps=fps, observe=seen.append)
     assert seen == []
     assert list(tmp_path.iterdir()) == []

@@ -49,10 +49,11 @@ def encode(
     clockwise: bool = False,
     transfer: int | None = None,
     pixel_aspect: Fraction | None = None,
+    matrix: str | None = None,
 ) -> Path:
     """Write `images` as H.264; `times` in seconds (default: FPS a second), `clockwise` marks the
     frames as to be turned by 90 degrees for display, as phones do; `transfer` is the code of the transfer function;
-    pixels are `pixel_aspect` times as wide as high."""
+    pixels are `pixel_aspect` times as wide as high; the file does not name the `matrix` of its colours."""
     import av
 
     with av.open(str(path), "w") as container:
@@ -69,6 +70,7 @@ def encode(
             if not stream.codec_context.is_open:
                 stream.height, stream.width = image.shape[:2]
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace=matrix)
             frame.pts = round(moment * 1000)
             frame.time_base = Fraction(1, 1000)
             container.mux(stream.encode(frame))

@@ -76,10 +76,12 @@ def test_when_a_file_was_written_is_no_time_of_its_photograph(tmp_path: Path, su
     assert "no times of their own" in notes[0]
 
 
-def test_a_burst_within_a_second_is_in_order_of_its_names(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fraction", [{}, {"Exif__SubsecTimeOriginal": "00"}])
+def test_a_burst_within_a_second_is_in_order_of_its_names(tmp_path: Path, fraction: dict[str, str]) -> None:
     for index in range(4):
         moment = f"2026:11:28 10:00:0{index // 2}"
-        write(tmp_path / f"{index}.jpg", np.full((20, 30, 3), 90, np.uint8), Exif__DateTimeOriginal=moment)
+        tags = {"Exif__DateTimeOriginal": moment, **fraction}
+        write(tmp_path / f"{index}.jpg", np.full((20, 30, 3), 90, np.uint8), **tags)
     frames, notes = convert(tmp_path)
     assert [frame.time for frame in frames] == [0, 1, 2, 3]
     assert "no fractions of a second" in notes[0]

@@ -100,11 +100,12 @@ def test_pixels_that_are_not_square_become_square(
     assert along[half + 2 :].min() > 0.7
 
 
-def test_colours_survive_the_codec(tmp_path: Path) -> None:
-    red = np.full((48, 64, 3), (200, 40, 30), np.uint8)
-    extract(encode(tmp_path / "a.mp4", [red] * 8), tmp_path / "out")
+@pytest.mark.parametrize(("height", "matrix"), [(48, "ITU601"), (576, "ITU601"), (720, "ITU709"), (1080, "ITU709")])
+def test_colours_survive_the_codec(tmp_path: Path, height: int, matrix: str) -> None:
+    red = np.full((height, 64, 3), (200, 40, 30), np.uint8)
+    extract(encode(tmp_path / "a.mp4", [red] * 8, matrix=matrix), tmp_path / "out")
     image = read_png(tmp_path / "out" / "00000.png")
-    assert np.abs(image[..., :3] * 255 - red).max() < 12
+    assert np.abs(image[..., :3] * 255 - red[0, 0]).max() < 6
 
 
 @pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])

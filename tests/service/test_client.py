@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx2
@@ -19,6 +19,7 @@ import pytest
 import uvicorn
 
 from client import AsyncClient, Client, ClientError, Event, RefusedError
+from client.calls import job_name
 from client.captures import packed
 from jobs.progress import ProgressReport, ProgressWriter
 from jobs.store import JobFolder
@@ -119,6 +120,29 @@ def test_a_capture_whose_files_have_no_time_is_packed(tmp_path: Path) -> None:
     os.utime(tmp_path / "old" / "a.png", (0, 0))
     with packed(tmp_path / "old") as path, zipfile.ZipFile(path) as archive:
         assert archive.read("a.png") == b"image"
+
+
+def test_linked_folders_of_a_capture_are_packed(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere" / "deep").mkdir(parents=True)
+    (tmp_path / "elsewhere" / "deep" / "a.png").write_bytes(b"image")
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "images").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "scene" / "transforms.json").write_text("{}")
+    with packed(tmp_path / "scene") as path, zipfile.ZipFile(path) as archive:
+        assert archive.namelist() == ["images/deep/a.png", "transforms.json"]
+    (tmp_path / "elsewhere" / "again").symlink_to(tmp_path / "scene")
+    with pytest.raises(ClientError, match="again"), packed(tmp_path / "scene"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [("scene_2024.05.01/", "scene_2024.05.01"), ("walk.zip", "walk"), ("walk.tar.gz", "walk"), ("a.b.tgz", "a.b")],
+)
+def test_a_job_has_the_name_of_its_capture(tmp_path: Path, file: str, name: str) -> None:
+    (tmp_path / file).mkdir() if file.endswith("/") else (tmp_path / file).touch()
+    assert job_name(None, tmp_path / file) == name
+    assert job_name("another", tmp_path / file) == "another"
 
 
 def finish_later(folder: JobFolder, remote: Client, job: str, delay_s: float) -> threading.Thread:
@@ -227,6 +251,23 @@ def test_a_busy_service_is_asked_again() -> None:
 def test_a_service_that_does_not_answer_is_an_error_with_its_address() -> None:
     with Client("http://127.0.0.1:9") as client, pytest.raises(ClientError, match=r"127\.0\.0\.1:9 does not answer"):
         client.readiness()
+
+
+@pytest.mark.parametrize("body", ["<html>Sign in</html>", "[]", "{}", "null", '"text"'])
+def test_another_program_at_the_address_is_an_error_with_the_address(body: str, tmp_path: Path) -> None:
+    def answer(request: httpx2.Request) -> httpx2.Response:
+        return httpx2.Response(200, headers={"Content-Type": "text/html"}, text=body)
+
+    with Client("http://other", transport=httpx2.MockTransport(answer)) as client:
+        requests: list[Callable[[], object]] = [
+            lambda: list(client.jobs()),
+            lambda: client.job("a" * 32),
+            lambda: client.render(path=tmp_path / "view.png"),
+        ]
+        for request in requests:
+            with pytest.raises(ClientError, match=r"http://other/.* answers, but not as this service does"):
+                request()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_capture_is_named(remote: Client, tmp_path: Path) -> None:
