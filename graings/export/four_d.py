@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from graings import constants
-from graings.camera.camera import Camera
 from graings.camera.units import Units
 from graings.errors import CheckpointError
 from graings.export.harmonics_fit import fit_splats
@@ -75,9 +74,9 @@ def four_d_file(model: Model, parts: int, degree: int | None, selection: Selecti
         dropped += int((~kept).sum())
         splats, children = fit.splats.rows(kept), fit.children[kept]
         degree = splats.degree
-        ends = [_positions(scene, cameras[0], time / parts, children, splats.means) for time in (part, part + 1)]
-        rows = _rows(splats, ends[1] - ends[0], model.units)
         at = np.searchsorted(slots, children.numpy())
+        first, last = (scene.geometry(time / parts, torch.from_numpy(at))[0] for time in (part, part + 1))
+        rows = _rows(splats, last - first, model.units)
         for name, values in rows.items():
             held.setdefault(name, np.zeros((len(slots), *values.shape[1:]), dtype=values.dtype))
         same = (began[at] >= 0) & _same({name: values[at] for name, values in held.items()}, rows)
@@ -95,13 +94,6 @@ def four_d_file(model: Model, parts: int, degree: int | None, selection: Selecti
     options = fourdgs.WriteOptions(profile="fine", library="graings")
     fourdgs.write(file, _gaussians(fourdgs, records, duration / parts, parts, degree or 0), duration, options=options)
     return FourDFile(file.getvalue(), len(records["began"]), dropped, degree or 0)
-
-
-def _positions(scene: PreparedScene, camera: Camera, time: float, children: Tensor, otherwise: Tensor) -> Tensor:
-    """Positions [n, 3] of `children` at `time`; `otherwise` [n, 3] for those that are not drawn then."""
-    shown = scene.compose(camera.center, time)
-    at = torch.searchsorted(shown.children, children).clamp_max(len(shown.children) - 1)
-    return torch.where((shown.children[at] == children).unsqueeze(1), shown.gaussians.means[at], otherwise)
 
 
 def _rows(splats: Splats, moved: Tensor, units: Units) -> Rows:

@@ -1,5 +1,6 @@
 // Comparison: a held-out photograph, the model from its camera, and their difference.
 
+import { refusal } from "/web/player/scene_file.js";
 import { element } from "./format.js";
 
 const $ = (id) => document.getElementById(id);
@@ -40,7 +41,7 @@ export class Comparison {
     const number = ++this.number;
     try {
       const response = await fetch(`${this.job.links.comparison}?camera=${$("held").value}`);
-      if (!response.ok) throw new Error((await response.json()).detail);
+      if (!response.ok) throw await refusal(response);
       const picture = await createImageBitmap(await response.blob());
       if (number !== this.number) return;
       const width = picture.width / PARTS.length;

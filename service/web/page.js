@@ -97,6 +97,12 @@ function choose(id) {
   if (changed) follow(id);
 }
 
+/** Show a job that may be older than those of the list. */
+async function open(id) {
+  if (!jobs.has(id)) jobs.set(id, await request(`/jobs/${id}`));
+  choose(id);
+}
+
 function show(job) {
   showFacts(job, {
     changed: async () => {
@@ -143,7 +149,7 @@ window.addEventListener("hashchange", () => {
   if (secret) return attempt(() => signIn(secret));
   if (!stage) return;
   const id = linked();
-  if (id && id !== current && jobs.has(id)) choose(id);
+  if (id && id !== current) attempt(() => open(id));
   else if (id === current) stage.player.state = location.hash.slice(1);
 });
 

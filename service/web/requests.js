@@ -1,11 +1,11 @@
 // Requests to the service, and what the session of this browser may do.
 
+import { refusal } from "/web/player/scene_file.js";
+
 export async function request(path, options) {
   const response = await fetch(path, options);
-  if (response.status === 204) return null;
-  const body = await response.json();
-  if (!response.ok) throw new Error(body.detail || body.title || response.statusText);
-  return body;
+  if (!response.ok) throw await refusal(response);
+  return response.status === 204 ? null : response.json();
 }
 
 const SCOPES = ["view", "read", "train", "admin"];

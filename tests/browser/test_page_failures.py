@@ -12,6 +12,12 @@ import pytest
 from service.keys import Keys, Scope
 from tests.browser.conftest import IdleService, OpenPage
 
+# The next event of the job may replace a message at once.
+RECORD_MESSAGES = """() => {
+  const message = document.querySelector(".message");
+  window.said = [];
+  new MutationObserver(() => said.push(message.textContent)).observe(message, { childList: true });
+}"""
 GO_TO = "hash => { location.hash = hash; }"
 
 
@@ -59,21 +65,30 @@ def test_an_error_of_an_action_stays_until_it_is_dismissed_or_the_next_action(
     assert page.locator("#failure").is_hidden()
 
 
+BUSY = {"status": 503, "content_type": "application/json", "body": json.dumps({"detail": "It restarts."})}
+PROXY = {"status": 502, "content_type": "text/html", "body": "<html>Bad gateway</html>"}  # not the service answers
+
+
+@pytest.mark.parametrize(("answer", "message"), [(BUSY, "It restarts."), (PROXY, "The service answered 502.")])
 @pytest.mark.parametrize("what", ["views", "scene"])
-def test_what_could_not_be_fetched_once_is_fetched_again(idle: IdleService, open_page: OpenPage, what: str) -> None:
+def test_what_could_not_be_fetched_once_is_fetched_again(
+    idle: IdleService, open_page: OpenPage, what: str, answer: dict[str, Any], message: str
+) -> None:
     page = open_page(idle.url, may_fail=f"/{what}")
     page.locator(".message", has_text="No model yet").wait_for()
     refused: list[str] = []
 
     def refuse(route: Any) -> None:
         refused.append(route.request.url)
-        route.fulfill(status=503, content_type="application/json", body=json.dumps({"detail": "It restarts."}))
+        route.fulfill(**answer)
 
+    page.evaluate(RECORD_MESSAGES)
     page.route(re.compile(f"/{what}"), refuse, times=1)
     idle.submit("walker", model=True)
     page.locator("#player[data-ready]").wait_for(timeout=60_000)
     assert len(refused) == 1
     assert page.locator(".message").text_content() == ""
+    assert message in page.evaluate("said")
 
 
 def test_a_stream_of_events_that_is_refused_is_opened_again(idle: IdleService, open_page: OpenPage) -> None:
@@ -106,6 +121,18 @@ def test_a_link_opened_in_a_page_that_is_open_shows_its_job(idle: IdleService, o
     page.locator("#name", has_text="shared").wait_for()
     assert page.locator("#jobs button").count() == 1
     assert "link" not in page.evaluate("location.href")
+
+
+def test_a_link_opened_in_a_page_that_is_open_shows_its_job_however_old_that_is(
+    idle: IdleService, open_page: OpenPage
+) -> None:
+    old = idle.submit("old")
+    for number in range(20):  # as many as the page lists at first
+        idle.submit(f"new-{number}")
+    page = open_page(idle.url)
+    page.locator("#jobs button").nth(19).wait_for()
+    page.evaluate(GO_TO, f"#job={old}")
+    page.locator("#name", has_text="old").wait_for(timeout=20_000)
 
 
 def test_a_link_opened_while_the_page_asks_for_a_key_shows_its_job(idle: IdleService, open_page: OpenPage) -> None:

@@ -85,6 +85,25 @@ def test_a_double_click_makes_one_job_and_the_preset_stays(
     assert httpx2.get(f"{idle.url}{job['links']['self']}").json()["config"]["preset"] == "standard"
 
 
+def test_an_option_out_of_range_is_refused_with_its_name_also_in_a_closed_section(
+    idle: IdleService, capture: Path, open_page: OpenPage, tmp_path: Path
+) -> None:
+    page = open_page(idle.url, may_fail="/jobs?preset=")
+    page.locator("#settings > summary").click()
+    page.get_by_label("iterations", exact=True).fill("-3")
+    page.locator("#settings > summary").click()
+    page.locator("#folder").set_input_files(folder(capture, tmp_path, "walking"))
+    page.get_by_role("button", name="Train").click()
+    page.locator("#refused", has_text="iterations").wait_for(timeout=20_000)
+
+
+def test_spans_of_time_have_no_60_seconds_or_minutes(idle: IdleService, open_page: OpenPage) -> None:
+    seconds = [0.4, 59.4, 59.6, 119.7, 3599.4, 3599.7, 7140, 7199]
+    code = "seconds => import('/web/format.js').then(({ span }) => seconds.map(span))"
+    shown = ["0 s", "59 s", "1 min 0 s", "2 min 0 s", "59 min 59 s", "1 h 0 min", "1 h 59 min", "2 h 0 min"]
+    assert open_page(idle.url).evaluate(code, seconds) == shown
+
+
 def test_a_capture_chosen_while_another_is_sent_is_kept(
     idle: IdleService, capture: Path, open_page: OpenPage, tmp_path: Path
 ) -> None:

@@ -85,7 +85,7 @@ export class Bar {
    * @param {{name: string}[]} cameras
    */
   list(cameras) {
-    const groups = new Map([["train", "Training cameras"], ["val", "Held-out cameras"], ["test", "Test cameras"]]);
+    const groups = new Map([["train", "Training cameras"], ["val", "Held-out cameras"]]);
     const chosen = this.cameras.value;
     this.cameras.replaceChildren(element("option", { value: "" }, "Go to camera…"));
     for (const [split, label] of groups) {

@@ -38,8 +38,8 @@ function turned(vector, axis, angle) {
 }
 
 /**
- * The camera of a viewpoint for a picture of this size. A picture of another shape than the capture's shows at least
- * what that shows: `aspect` is the capture's width over its height.
+ * The camera of a viewpoint for a picture of this size. The picture shows at least the largest rectangle of `aspect`,
+ * width over height, in it: that of the view the player begins with, which other views of a capture may not have.
  * @param {Viewpoint} view
  * @param {number} width
  * @param {number} height

@@ -1,9 +1,7 @@
 // Pictures: the server's exact pictures, one request at a time, then that of the newest view.
 
 import { renderQuery } from "./camera.js";
-
-/** #rrggbb of RGB in [0, 1]. */
-export const hex = (rgb) => "#" + rgb.map((x) => Math.round(255 * x).toString(16).padStart(2, "0")).join("");
+import { refusal } from "./scene_file.js";
 
 /** RGB in [0, 1] of #rrggbb. */
 export const rgb = (text) => [1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16) / 255);
@@ -60,7 +58,7 @@ export class Pictures {
       this.wanted = null;
       try {
         const response = await fetch(address);
-        if (!response.ok) throw new Error((await response.json()).detail ?? response.statusText);
+        if (!response.ok) throw await refusal(response);
         const made = URL.createObjectURL(await response.blob());
         if (number !== this.number && !this.alone) {
           URL.revokeObjectURL(made);

@@ -115,7 +115,7 @@ export class Player {
       renderer.setOrder(order);
       // What was shown before remains until the new scene can be drawn.
       if (this.sorter !== sorter && wanted()) this.show({ canvas, renderer, sorter });
-      else if (this.sorter !== sorter) sorter.close();
+      else if (this.sorter !== sorter) [sorter, renderer].forEach((unused) => unused.close());
       this.dirty = true;
       this.wake();
     });

@@ -107,6 +107,12 @@ export function functionsAt(basis, time, target) {
   }
 }
 
+/** Why a request was refused: what the service says, or the status if a proxy in between answers. */
+export async function refusal(response) {
+  const problem = await response.json().catch(() => ({}));
+  return new Error(problem.detail ?? problem.title ?? `The service answered ${response.status}.`);
+}
+
 /**
  * The bytes of a file.
  * @param {string} address
@@ -114,7 +120,7 @@ export function functionsAt(basis, time, target) {
  */
 export async function download(address, report) {
   const response = await fetch(address);
-  if (!response.ok) throw new Error((await response.json()).detail ?? response.statusText);
+  if (!response.ok) throw await refusal(response);
   const total = Number(response.headers.get("Content-Length"));
   const parts = [];
   let received = 0;

@@ -66,7 +66,6 @@ self.onmessage = ({ data }) => {
     keys = new Uint32Array(scene.count);
     return;
   }
-  const started = performance.now();
   const order = sorted(data.forward, data.center, data.functions);
-  self.postMessage({ request: data.request, order, milliseconds: performance.now() - started }, [order.buffer]);
+  self.postMessage({ order }, [order.buffer]);
 };

@@ -11,10 +11,8 @@ export class Sorter {
   constructor(scene, address, receive) {
     this.scene = scene;
     this.receive = receive;
-    this.milliseconds = 0;
     this.busy = false;
     this.wanted = null;
-    this.requests = 0;
     this.functions = new Float32Array(scene.geometry.rank * scene.geometry.values);
     this.worker = new Worker(address);
     const { count, means, geometry, header } = scene;
@@ -22,15 +20,9 @@ export class Sorter {
     this.worker.postMessage({ scene: { count, means, rows, rank, weights, near: header.raster.near } });
     this.worker.onmessage = ({ data }) => {
       this.busy = false;
-      this.milliseconds = data.milliseconds;
       this.receive(data.order);
       if (this.wanted) this.sort(...this.wanted);
     };
-  }
-
-  /** Whether an order is under way. */
-  get pending() {
-    return this.busy;
   }
 
   /**
@@ -45,7 +37,7 @@ export class Sorter {
     this.wanted = null;
     this.busy = true;
     functionsAt(this.scene.geometry, time, this.functions);
-    this.worker.postMessage({ request: ++this.requests, forward: camera.rotation.slice(6, 9), center: camera.center, functions: this.functions });
+    this.worker.postMessage({ forward: camera.rotation.slice(6, 9), center: camera.center, functions: this.functions });
   }
 
   close() {
