@@ -42,7 +42,7 @@ class AblationRun:
     @property
     def finished(self) -> bool:
         """Whether the folder holds the metrics of the last iteration."""
-        return _final_metrics(self.folder, self.config.iterations) is not None
+        return _final_metrics(self.folder) is not None
 
     @property
     def diverged(self) -> bool:
@@ -141,7 +141,7 @@ class Ablation:
         )
 
     def _metrics(self, row: Row, seed: int) -> Metrics | None:
-        return _final_metrics(self.folder / _run_folder(row, seed), self._options["iterations"])
+        return _final_metrics(self.folder / _run_folder(row, seed))
 
     def _with_earlier(self) -> tuple[tuple[Row, ...], tuple[int, ...]]:
         """Rows and seeds of the table: those of this call, and those of an earlier call on the same folder."""
@@ -173,16 +173,16 @@ def _run_folder(row: Row, seed: int) -> str:
     return f"{row.name}/seed-{seed}"
 
 
-def _final_metrics(run: Path, iterations: int) -> Metrics | None:
-    """The metrics of a run that has ended, else None: before the end there is no split.
+def _final_metrics(run: Path) -> Metrics | None:
+    """The metrics of a run that has ended, else None.
 
-    A restarted run has more than `iterations`. A run that diverged has splits too, but they are not those of its row.
+    A run that was interrupted or diverged may have splits too, but they are not those of its row.
     """
     file = run / METRICS_FILE
     if not file.exists():
         return None
     metrics = read_metrics(file)
-    ended = metrics.iterations >= iterations and not metrics.diverged
+    ended = metrics.iterations >= metrics.iterations_planned and not metrics.diverged
     return metrics if ended and "val" in metrics.splits else None
 
 

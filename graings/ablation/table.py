@@ -124,7 +124,7 @@ def make_table(
         seeds=tuple(seeds),
         rows=tuple(_row(row, runs, full) for row, runs in rows),
         paper=PaperSource(source=f"GrainGS, tables of the ablation study: {SCENES}"),
-        commits=tuple(sorted({str(metrics.versions.commit) for metrics in finished})),
+        commits=tuple(sorted({metrics.versions.commit for metrics in finished if metrics.versions.commit})),
         machines=tuple(sorted({metrics.machine.cpu for metrics in finished})),
     )
 

@@ -14,6 +14,7 @@ from graings.capture.synthetic import SUITE
 from graings.errors import CheckpointError
 from graings.report.metrics_document import Metrics, read_metrics
 from graings.report.run_record import read_record
+from graings.report.work_precision import named_folder
 from graings.storage.run_folder import METRICS_FILE, newest_model
 
 SIDE: Final = 320  # px of stills and clips
@@ -73,7 +74,7 @@ def write_gallery(
     Raises `ValueError` for two runs of one name and for one whose page would be that of the gallery, and
     `CheckpointError` for a folder that holds no finished run. All runs are looked at before anything is rendered.
     """
-    names = [run.resolve().name for run in runs]
+    names = [named_folder(run.resolve()).name for run in runs]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"runs are named after their folders, and several are {', '.join(twice)}; rename one")
     if Path(PAGE_FILE).stem in names:

@@ -18,6 +18,8 @@ from graings.camera.units import Units
 
 # Bounds of an orbit's radius in normalised units; beyond them rounding makes the camera's position meaningless.
 MIN_DISTANCE, MAX_DISTANCE = 1e-9, 1e9
+# Radius where the training views look around from the centre of the scene, normalised units.
+MIN_ORBIT = 0.01
 
 
 def orbit_view(
@@ -35,8 +37,8 @@ def orbit_view(
 
     `azimuth` is about the capture's vertical axis, `elevation` above the horizon, both in degrees; `radius` and
     `target` [3] are in capture units, `fov` is the full horizontal angle in degrees. Defaults: the side where the
-    cameras of `model_views` stand, or azimuth 0 if they stand all around; their median radius and elevation; the
-    scene's centre; the field of view and size of the first view.
+    cameras of `model_views` stand, or azimuth 0 if they stand all around; their median radius (0.01 normalised units
+    at least) and elevation; the scene's centre; the field of view and size of the first view.
     Raises `ValueError` naming the parameter.
     """
     if not model_views:
@@ -51,7 +53,7 @@ def orbit_view(
     arms = np.stack([view.camera.center for view in model_views]) - aim_normalised
     lengths = np.linalg.norm(arms, axis=1)
     if radius is None:
-        radius = float(np.median(lengths)) / units.scale
+        radius = max(float(np.median(lengths)), MIN_ORBIT) / units.scale
     if elevation is None:
         elevation = float(np.median(elevations(arms, up)))
     if azimuth is None:

@@ -14,15 +14,24 @@ from graings.capture.names import FileNames
 from graings.errors import CaptureError
 
 
+def is_utf8(name: str) -> bool:
+    """Whether a name can be encoded; bytes of another encoding come from the file system as lone surrogates."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+
+
 class CaptureFolder:
     """A capture on disk. All names are relative to `root`, with forward slashes."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.resolve()
+        if not is_utf8(str(self.root)):
+            remedy = "Rename the folder, or the one above it that has such a name."
+            raise CaptureError("its path is not UTF-8, so that images cannot be opened", file=root, remedy=remedy)
         self._digests: dict[str, str] = {}
         self._images: dict[str, ImageFile] = {}
         self._names = FileNames(self.root)
         self._respelled: dict[str, str] = {}
+        self._pictures: dict[str, list[str]] = {}
 
     def locate(self, name: str, *, source: str, field: str | None = None) -> Path:
         """The path of `name`, whether it exists or not; `source` and `field` are where the capture names it.
@@ -59,6 +68,10 @@ class CaptureFolder:
         try:
             if not path.is_file():
                 raise CaptureError("is missing or not a regular file", file=name, remedy="Add it to the capture.")
+            if not is_utf8(name):  # OpenImageIO opens no other names
+                raise CaptureError(
+                    "has a name that is not UTF-8", file=name, remedy="Rename it, also where it is listed."
+                )
             data = path.read_bytes()
         except OSError as error:
             raise CaptureError(
@@ -106,6 +119,15 @@ class CaptureFolder:
                 remedy="Add the image or remove its entry.",
             )
         return image
+
+    def pictures(self, place: str) -> list[str]:
+        """Names of the pictures in the folder `place`, relative to `root`, sorted; not those of folders in it."""
+        if place not in self._pictures:
+            path = self.root / place
+            files = path.iterdir() if path.is_dir() else ()
+            shown = (file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
+            self._pictures[place] = sorted(f"{place}/{file.name}" for file in shown)
+        return self._pictures[place]
 
     def notes(self) -> list[str]:
         """What was assumed about the names of the files read so far."""

@@ -154,7 +154,9 @@ def _open(path: Path, name: str) -> oiio.ImageInput:
         )
     if spec.deep or spec.depth != 1:
         raise CaptureError("is a deep or volume image", file=name, remedy="Flatten it.")
-    if (spec.x, spec.y, spec.full_width, spec.full_height) != (0, 0, spec.width, spec.height):
+    # Of other formats the offset says where the picture was cut from; the file holds all that is left.
+    part = (spec.x, spec.y, spec.full_width, spec.full_height) != (0, 0, spec.width, spec.height)
+    if part and source.format_name() == "openexr":
         raise CaptureError(
             "contains only a part of its frame (data window differs from display window)",
             file=name,

@@ -50,6 +50,9 @@ SNAP_COSINE = math.cos(math.radians(10.0))
 # The right axes of the cameras lie in a plane if their second moment across it is below this fraction of the next one.
 PLANAR_RATIO = 0.05
 
+# Directions that differ by less are parallel: rounding of their components.
+PARALLEL = 1e-6
+
 # Distances below this, in the capture's unit, count as zero.
 MIN_DISTANCE = 1e-12
 
@@ -207,8 +210,10 @@ def up_axis(cameras: Sequence[Camera]) -> tuple[float, float, float]:
     rights = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
     values, vectors = np.linalg.eigh(rights.T @ rights / len(cameras))
     # Right axes of level cameras are horizontal at any elevation, whereas the up axis of a camera that looks down is
-    # far from vertical. With one camera, or with cameras rolled arbitrarily, only the mean is defined.
-    axis = vectors[:, 0] if values[0] < PLANAR_RATIO * values[1] else mean
+    # far from vertical. With parallel right axes, as of one camera, or with cameras rolled arbitrarily, only the mean
+    # is defined.
+    parallel = values[1] < PARALLEL * values[2]
+    axis = vectors[:, 0] if values[0] < PLANAR_RATIO * values[1] and not parallel else mean
     if axis @ mean < 0:
         axis = -axis
     length = float(np.linalg.norm(axis))
@@ -234,7 +239,10 @@ def _point_of_interest(cameras: Sequence[Camera], centers: Array) -> tuple[Array
         return middle, ["the cameras look outwards: the scene is centred on the cameras"]
     spread = float(np.percentile(np.linalg.norm(centers - middle, axis=1), 90))
     forward = axes.mean(axis=0)
-    forward = forward / np.linalg.norm(forward)
+    length = float(np.linalg.norm(forward))
+    if length < PARALLEL:
+        return middle, []  # cameras on one line that look at each other
+    forward = forward / length
     if spread < MIN_DISTANCE:
         return middle + forward, [
             "no_scale: one camera position and no points, so the size of the scene is unknown; "

@@ -38,8 +38,8 @@ def inspect(
             raise typer.BadParameter(problem, param_hint="--set")
     config = make_config(overrides=overrides)
     with busy_status("reading the capture, and matching its pictures"):
-        document, png = inspect_capture(capture, config.capture, kept_calibration())
-    if picture is not None:
+        document, png = inspect_capture(capture, config.capture, kept_calibration(), picture=picture is not None)
+    if picture is not None and png is not None:
         write_bytes(picture, png)
     if as_json:
         Console().print_json(json.dumps(document.to_json()))

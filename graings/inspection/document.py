@@ -12,7 +12,7 @@ from graings.inspection.consistency import Consistency
 from graings.plan.capture_statistics import CaptureStatistics
 
 Vector = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
+Distance = Annotated[float, Field(ge=0)]
 
 Subject = Literal["poses", "units", "times", "pictures", "points", "masks"]
 
@@ -51,7 +51,7 @@ class Inspection(Document):
         "the cameras see around the centre."
     )
     up: Vector = Field(description="Axis that points up.")
-    camera_distance: tuple[Positive, Positive, Positive] = Field(
+    camera_distance: tuple[Distance, Distance, Distance] = Field(
         description="Least, median and greatest distance of a camera from the centre, in the capture's unit."
     )
     statistics: CaptureStatistics = Field(description="What the training images show.")

@@ -80,7 +80,7 @@ def _points(capture: Capture) -> list[Finding]:
 
 
 def _units(distance: float) -> list[Finding]:
-    if 1 / MAX_UNIT <= distance <= MAX_UNIT:
+    if distance == 0 or 1 / MAX_UNIT <= distance <= MAX_UNIT:
         return []
     text = f"the median camera is {distance:.3g} units from the centre, which is unusual for metres"
     remedy = "Training has its own unit, but views are asked for in the unit of the capture: check that it is meant."

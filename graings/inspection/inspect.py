@@ -27,15 +27,20 @@ PRESETS: Final = ("draft", "standard", "fine")
 # Points outside this share, on either side and each axis, do not count for the bounds: matches go astray.
 OUTLIERS: Final = 0.02
 
+# Normalised distance of a camera from the centre that is none: it turns on the spot.
+ROUNDING: Final = 1e-9
+
 # Of a training process without images and anchors, MB.
 BASE_MB: Final = 450.0
 MEGABYTE: Final = 1e6
 
 
 def inspect_capture(
-    path: Path, config: CaptureConfig | None = None, calibration: Calibration | None = None
-) -> tuple[Inspection, bytes]:
-    """The document, and a PNG of some cameras with the bounds of the scene. Raises `CaptureError` where it is refused.
+    path: Path, config: CaptureConfig | None = None, calibration: Calibration | None = None, *, picture: bool = False
+) -> tuple[Inspection, bytes | None]:
+    """The document, and with `picture` a PNG of some cameras with the bounds of the scene.
+
+    Raises `CaptureError` where the capture is refused.
 
     `calibration` holds the times of this machine; without it no minutes are predicted.
     """
@@ -67,7 +72,7 @@ def inspect_capture(
         notes=capture.notes,
         forecasts={preset: _forecast(statistics, preset, seen, calibration) for preset in PRESETS},
     )
-    return document, draw_cameras(capture, images, (low, high))
+    return document, draw_cameras(capture, images, (low, high)) if picture else None
 
 
 def bounds(capture: Capture) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -85,7 +90,8 @@ def bounds(capture: Capture) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def _distances(capture: Capture) -> tuple[float, float, float]:
     lengths = np.array([np.linalg.norm(frame.camera.center) for frame in capture.train]) / capture.units.scale
-    least, median, greatest = np.maximum(np.quantile(lengths, (0.0, 0.5, 1.0)), 1e-12).tolist()
+    lengths[lengths < ROUNDING / capture.units.scale] = 0.0
+    least, median, greatest = np.quantile(lengths, (0.0, 0.5, 1.0)).tolist()
     return least, median, greatest
 
 

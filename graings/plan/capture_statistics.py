@@ -140,7 +140,8 @@ def _cameras(frames: Sequence[Frame]) -> list[list[Frame]]:
     groups: dict[object, list[Frame]] = {}
     for frame in frames:
         camera = frame.camera
-        key = (camera.world_to_camera.tobytes(), camera.fx, camera.fy, camera.cx, camera.cy, camera.width)
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        key = (camera.world_to_camera.tobytes(), lens)
         groups.setdefault(key, []).append(frame)
     return [sorted(group, key=lambda frame: frame.time) for group in groups.values()]
 

@@ -14,12 +14,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 import graings
 from graings.config import TrainConfig
 from graings.document import Document
-from graings.errors import CheckpointError
 from graings.plan.capture_statistics import CaptureStatistics
 
 CALIBRATION_FILE: Final = "calibration.json"
@@ -149,7 +148,7 @@ def _loads(statistics: CaptureStatistics, config: TrainConfig) -> Sequence[tuple
     }
     reduced = max(statistics.width, statistics.height) >= 400
     loads = []
-    for begin, end in _pairs(sorted(marks)):
+    for begin, end in pairwise(sorted(marks)):
         small = reduced and end <= config.scaled(config.low_resolution_until)
         grown = begin >= config.scaled(config.density.grow_from)
         joint = temporal and begin >= config.scaled(config.warmup)
@@ -165,10 +164,6 @@ def _loads(statistics: CaptureStatistics, config: TrainConfig) -> Sequence[tuple
     return loads
 
 
-def _pairs(marks: Sequence[int]) -> list[tuple[int, int]]:
-    return list(pairwise(marks))
-
-
 def cache_folder() -> Path:
     """Where measurements of this machine are kept: `graings` in the user's cache folder (XDG_CACHE_HOME)."""
     base = os.environ.get("XDG_CACHE_HOME", "")
@@ -180,6 +175,6 @@ def stored_calibration(folder: Path | None = None) -> Calibration | None:
     file = (folder or cache_folder()) / CALIBRATION_FILE
     try:
         stored = Calibration.model_validate_json(file.read_text(encoding="utf-8"))
-    except (OSError, ValidationError, ValueError, CheckpointError):
+    except (OSError, ValueError):
         return None  # it is measured again when a plan is asked for
     return stored if stored.version == graings.__version__ else None

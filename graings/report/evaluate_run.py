@@ -8,8 +8,8 @@ from pathlib import Path
 from graings.capture.capture import Capture, Split
 from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
-from graings.capture.trajectories import read_trajectories
-from graings.errors import CheckpointError
+from graings.capture.trajectories import Trajectories, read_trajectories
+from graings.errors import CheckpointError, ConfigError
 from graings.evaluation.evaluate import evaluate
 from graings.evaluation.metrics import SplitMetrics
 from graings.evaluation.motion import MotionMetrics, measure_motion
@@ -30,7 +30,8 @@ def evaluate_run(
     The capture is read from where it was during training unless `capture` names another place. With a `background` [3]
     other than that of training nothing is written: such metrics only tell whether opaque objects are opaque and empty
     space is empty. Of a capture with `trajectories.json` the error of tracked points is written too. Raises
-    `CheckpointError` when the run has no model or the capture is not the one it was trained on.
+    `CheckpointError` when the run has no model or the capture is not the one it was trained on, and `ConfigError` for a
+    background of opaque images.
     """
     model = open_model(run)
     record = read_record(run)
@@ -39,21 +40,25 @@ def evaluate_run(
         raise CheckpointError(
             f"{data.root}: not the capture this run was trained on. Give the original with --capture."
         )
+    if background is not None and not data.has_alpha:
+        raise ConfigError(
+            f"{data.root}: has images without alpha, whose background cannot be exchanged. Leave out the background."
+        )
     frames = data.split(split)
+    # Before the views are rendered: what cannot be read is told in a second.
+    document, trajectories = read_metrics(run / METRICS_FILE), read_trajectories(data.root)
     color = model.background if background is None else background
     images = ImageStore(color, model.config.capture.cache_mb)
     metrics = evaluate(model.scene, frames, images, color, distances=PerceptualDistances.find())
     if background is not None:
         return metrics
-    document = read_metrics(run / METRICS_FILE)
-    update = {"splits": {**document.splits, split: metrics}, "motion": _motion(model, data)}
+    update = {"splits": {**document.splits, split: metrics}, "motion": _motion(model, data, trajectories)}
     write_document(run / METRICS_FILE, document.model_copy(update=update))
     return metrics
 
 
-def _motion(model: Model, capture: Capture) -> MotionMetrics | None:
+def _motion(model: Model, capture: Capture, trajectories: Trajectories | None) -> MotionMetrics | None:
     """The error of tracked points; None where the capture has no trajectories."""
-    trajectories = read_trajectories(capture.root)
     if trajectories is None:
         return None
     times = [capture.units.time(time) for time in trajectories.times]

@@ -56,12 +56,16 @@ def read_run(path: Path) -> Metrics:
     return read_metrics(file)
 
 
+def named_folder(run: Path) -> Path:
+    """The folder that a run is named after: its own, or that above `run`, as all runs of jobs are called."""
+    return run.parent if run.name == "run" and run.parent.name else run
+
+
 def run_names(paths: Sequence[Path]) -> list[str]:
     """The shortest ends of `paths` that tell the runs apart. Raises `ValueError` when one is given twice."""
     folders = [path.resolve() for path in paths]
     folders = [path.parent if path.is_file() else path for path in folders]
-    # The run of a job is always called run/: the folder above it carries the job's id.
-    folders = [path.parent if path.name == "run" and path.parent.name else path for path in folders]
+    folders = [named_folder(path) for path in folders]
     twice = next((path for path in folders if folders.count(path) > 1), None)
     if twice is not None:
         raise ValueError(f"{twice} is given twice")

@@ -33,7 +33,6 @@ class TrainedRun(Document):
     preset: str | None = Field(description="Preset of its options; null where the options are unknown.")
     iterations_planned: Count = Field(description="Iterations of the whole run, those before a restart included.")
     seed: int = Field(description="Seed of the random streams.")
-    n_seeds: int = Field(1, gt=0, description="Runs behind these numbers.")
     hashes: Hashes = Field(description="What identifies the options and the capture.")
 
 

@@ -47,6 +47,15 @@ def test_orbit_reads_radius_and_target_in_the_captures_units() -> None:
     np.testing.assert_allclose(camera.forward, (target - eye) / 8.0, atol=1e-12)
 
 
+def test_training_views_that_turn_on_the_spot_have_an_orbit_about_it() -> None:
+    turning = [
+        View("v", Camera.look_at((0, 0, 0), (math.cos(a), math.sin(a), 0.0), fov=0.7, width=40, height=30), 0.0)
+        for a in np.linspace(0, 5, 12)
+    ]
+    camera = orbit_view(turning, UNITS)
+    assert math.isclose(float(np.linalg.norm(camera.center)), 0.01, rel_tol=1e-9)
+
+
 def test_a_camera_at_the_target_has_elevation_zero() -> None:
     at_center = View("c", Camera(np.eye(4), 50.0, 50.0, 20.0, 15.0, 40, 30), 0.0)
     camera = orbit_view((at_center,), UNITS, radius=4.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 import tracemalloc
 import zlib
@@ -182,6 +183,24 @@ def test_notes_print_too(tmp_path: Path) -> None:
     notes = load_capture(tmp_path).notes
     assert any("\\udcff\\x1b" in note for note in notes)
     assert all(note.isprintable() for note in notes)
+
+
+def test_names_and_folders_of_another_encoding_are_refused(tmp_path: Path) -> None:
+    latin = os.fsdecode(b"caf\xe9")
+    write_dnerf(tmp_path / "cafe/scene")
+    try:
+        (tmp_path / "cafe").rename(tmp_path / latin)
+    except OSError:
+        pytest.skip("the file system has no such names")
+    with pytest.raises(CaptureError, match=r"caf\\udce9/scene: its path is not UTF-8.*Rename"):
+        load_capture(tmp_path / latin / "scene")
+    folder = tmp_path / "colmap"
+    write_colmap(folder, text=True)
+    file = folder / "sparse/0/images.txt"
+    file.write_bytes(file.read_bytes().replace(b"frame_0010", b"caf\xe9"))
+    (folder / "images/frame_0010.png").rename(folder / "images" / f"{latin}.png")
+    with pytest.raises(CaptureError, match=r"caf\\udce9\.png: has a name that is not UTF-8.*Rename"):
+        load_capture(folder)
 
 
 @given(st.text(alphabet=st.characters(), max_size=5_000))

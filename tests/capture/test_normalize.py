@@ -106,6 +106,31 @@ def test_level_cameras_give_an_exact_up_axis() -> None:
     assert up_axis(cameras) == (0.0, 0.0, 1.0)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_cameras_with_parallel_right_axes_have_their_mean_up_axis(seed: int) -> None:
+    """One camera, or several that differ in place and elevation only: rounding must not choose the axis."""
+    generator = np.random.default_rng(seed)
+    eye, azimuth = generator.normal(size=3) * 3, float(generator.uniform(0, 360))
+    one = Camera.look_at(eye, (0, 0, 0), up=(0.0, 0.6, 0.8), fov=0.7, width=8, height=8)
+    several = [Camera.orbit(azimuth, e, 4.0, fov=0.7, width=8, height=8) for e in (-30.0, 0.0, 45.0)]
+    for cameras in ([one], [one] * 12, several):
+        mean = np.mean([-camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+        assert np.array(up_axis(cameras)) @ mean / np.linalg.norm(mean) > math.cos(math.radians(10.1))
+
+
+def test_cameras_that_look_at_each_other_centre_between_them() -> None:
+    for axis in np.eye(3):
+        ends = [np.array([1.0, 2.0, 3.0]) + sign * 3 * axis for sign in (1, -1)]
+        up = np.roll(axis, 1)
+        cameras = [
+            Camera.look_at(eye, other, up=up, fov=0.7, width=8, height=8)
+            for eye, other in zip(ends, ends[::-1], strict=True)
+        ]
+        center, scale, _ = center_and_scale(cameras, None)
+        np.testing.assert_allclose(center, (1.0, 2.0, 3.0), atol=1e-12)
+        assert scale == 0.25
+
+
 def test_tilted_up_axis_is_kept() -> None:
     up = np.array([0.0, 0.6, 0.8])
     cameras = [Camera.orbit(a, 20.0, 4.0, up=up, fov=0.7, width=8, height=8) for a in range(0, 360, 30)]

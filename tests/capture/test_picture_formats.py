@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,28 @@ def replace_image(folder: Path, suffix: str, image: NDArray[Any], **attributes: 
     """The picture r_002 of a D-NeRF capture as another file."""
     (folder / "train/r_002.png").unlink()
     return write_as(folder / f"train/r_002{suffix}", image, **attributes)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_a_picture_that_was_cut_from_a_larger_one_is_read(tmp_path: Path, suffix: str) -> None:
+    """Image editors keep the offset of a crop (oFFs of PNG, XPosition of TIFF); the file holds the whole crop."""
+    folder = write_dnerf(tmp_path)
+    (folder / "train/r_002.png").unlink()
+    file = folder / f"train/r_002{suffix}"
+    if suffix == ".png":
+        Image.fromarray(smooth()).save(file)
+        offset, content = b"oFFs" + struct.pack(">iiB", 7, 5, 0), file.read_bytes()
+        chunk = struct.pack(">I", 9) + offset + struct.pack(">I", zlib.crc32(offset))
+        file.write_bytes(content[:33] + chunk + content[33:])  # after the signature and IHDR
+    else:
+        image = oiio.ImageBuf(oiio.ImageSpec(oiio.ROI(7, 19, 5, 17, 0, 1, 0, 3), "uint8"))
+        image.set_pixels(image.roi, smooth() / np.float32(255))
+        assert image.write(str(file)), image.geterror()
+    stored = oiio.ImageInput.open(str(file)).spec()
+    assert (stored.x, stored.y) == (7, 5)
+    capture = load_capture(folder)
+    rgb = ImageStore(BLACK).rgb(capture.train[2])
+    np.testing.assert_allclose(rgb, smooth() / np.float32(255), atol=1e-3)
 
 
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".PNG", ".JFIF", ".TIF"])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +56,25 @@ def test_a_rig_of_still_cameras_is_read_when_asked(tmp_path: Path, place: str) -
     assert not train & test
 
 
+def test_a_folder_of_frames_is_listed_once_whatever_the_number_of_its_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for index in range(12):
+        write_image(tmp_path / f"images/cam00/{index:05d}.png", pixels(12, 12, seed=index))
+    frames = [entry(orbit(index, 12), f"images/cam00/{index:05d}.png", index / 12) for index in range(12)]
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    listed: list[Path] = []
+    iterdir = Path.iterdir
+
+    def counted(path: Path) -> Iterator[Path]:
+        listed.append(path)
+        return iterdir(path)
+
+    monkeypatch.setattr(Path, "iterdir", counted)
+    load_capture(tmp_path)
+    assert listed.count(tmp_path / "images/cam00") == 1
+
+
 def test_a_rig_without_the_frames_of_a_camera_names_it(tmp_path: Path) -> None:
     shutil.rmtree(rig(tmp_path) / "frame_0030")
     with pytest.raises(CaptureError, match=r"the camera frame_0030\.png has no folder of frames"):
@@ -102,10 +123,11 @@ def of_cameras(*cameras: str, times: int = 3) -> set[str]:
     return {f"{camera}/f{5 + time:03d}.png" for camera in cameras for time in range(times)}
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
 @pytest.mark.parametrize("listed", ["frame_0000.png", "frame_0000/f005.png frame_0000/f006.png frame_0000/f007.png"])
-def test_a_test_list_of_a_rig_names_cameras_or_frames(tmp_path: Path, listed: str) -> None:
+def test_a_test_list_of_a_rig_names_cameras_or_frames(tmp_path: Path, listed: str, encoding: str) -> None:
     folder = rig(tmp_path)
-    (folder / "test.txt").write_text("\n".join([*listed.split(), "frame_0070.png", ""]))
+    (folder / "test.txt").write_text("\n".join([*listed.split(), "frame_0070.png", ""]), encoding=encoding)
     capture = load_capture(folder, RIG)
     assert held_out(capture) == of_cameras("frame_0000", "frame_0070")
     assert held_out(capture) & held_out(capture, "train") == set()

@@ -161,6 +161,10 @@ def test_a_lens_of_the_frame_wins_over_that_of_the_file(tmp_path: Path) -> None:
     assert all(frame.lens is None for _, frame in capture)
 
 
+def test_an_empty_name_of_points_means_none(tmp_path: Path) -> None:
+    assert load_capture(write_single(tmp_path, ply_file_path="")).points is None
+
+
 def test_points_are_those_of_the_ply_file(tmp_path: Path) -> None:
     header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {axis}\n" for axis in "xyz")
     header += "".join(f"property uint8 {color}\n" for color in ("red", "green", "blue")) + "end_header\n"

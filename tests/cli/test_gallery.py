@@ -65,6 +65,13 @@ def test_runs_that_are_not_finished_or_share_a_name_are_refused(run: Path, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+def test_runs_of_jobs_are_named_after_their_jobs(run: Path, tmp_path: Path) -> None:
+    jobs = [Path(shutil.copytree(run, tmp_path / f"{name}/run")) for name in ("first", "second")]
+    found = CliRunner().invoke(app, ["gallery", *map(str, jobs), "-o", str(tmp_path / "gallery")])
+    assert found.exit_code == 0, found.output
+    assert {"first.webp", "second.webp"} <= {path.name for path in (tmp_path / "gallery").iterdir()}
+
+
 @pytest.mark.parametrize("wrong", ["unfinished", "without metrics", "without record", "without model", "named index"])
 def test_a_run_that_cannot_be_shown_is_refused_before_others_are_rendered(
     run: Path, tmp_path: Path, wrong: str

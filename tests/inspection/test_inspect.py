@@ -23,6 +23,7 @@ from graings.storage.files import write_document
 from tests.capture.captures import (
     entry,
     orbit,
+    pixels,
     write_colmap,
     write_dnerf,
     write_image,
@@ -74,7 +75,7 @@ def findings(found: Inspection, about: str) -> list[str]:
 
 
 def test_a_good_capture_is_described_without_a_finding(tmp_path: Path) -> None:
-    found, picture = inspect_capture(write_floor(tmp_path), CaptureConfig())
+    found, picture = inspect_capture(write_floor(tmp_path), CaptureConfig(), picture=True)
     assert found.findings == ()
     assert (found.kind, found.images, found.source_size) == ("transforms", {"train": 11, "val": 1}, (160, 120))
     assert found.time_range == (0.0, 11 / 12)
@@ -85,7 +86,22 @@ def test_a_good_capture_is_described_without_a_finding(tmp_path: Path) -> None:
     text = "\n".join(found.lines())
     assert "11 train, 1 val images" in text
     assert "SUSPICIOUS" not in text
+    assert picture is not None
     assert picture.startswith(b"\x89PNG")
+
+
+def test_a_camera_that_turns_on_the_spot_is_no_mistake_of_units(tmp_path: Path) -> None:
+    cameras = [
+        Camera.look_at((5, 6, 7), (5 + np.cos(a), 6 + np.sin(a), 7), fov=0.8, width=32, height=24)
+        for a in np.linspace(0.0, 5.0, 12)
+    ]
+    for index in range(12):
+        write_image(tmp_path / f"train/{index}.png", pixels(24, 32, seed=index))
+    write_transforms(tmp_path, "train", [entry(camera, f"train/{index}") for index, camera in enumerate(cameras)])
+    found, picture = inspect_capture(tmp_path)
+    assert picture is None
+    assert found.camera_distance == (0.0, 0.0, 0.0)
+    assert [finding for finding in found.findings if finding.about == "units"] == []
 
 
 @pytest.mark.parametrize(

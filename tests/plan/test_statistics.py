@@ -13,7 +13,7 @@ from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
 from graings.config import CaptureConfig
 from graings.plan.capture_statistics import MAX_IMAGES, _cameras, _sample, measure
-from tests.capture.captures import write_colmap
+from tests.capture.captures import entry, orbit, write_colmap, write_image, write_transforms
 from tests.plan.fixed_cameras import WHITE, noisy, shifted, square, statistics_of, texture, write_fixed
 
 
@@ -63,6 +63,18 @@ def test_a_motion_with_the_period_of_the_sampling_is_found(tmp_path: Path) -> No
     assert found.examined <= MAX_IMAGES
     assert found.change is not None
     assert found.change.ratio > 1
+
+
+def test_pictures_of_several_heights_are_of_several_cameras(tmp_path: Path) -> None:
+    lens = {"fl_x": 40.0, "fl_y": 40.0, "cx": 16.0, "cy": 9.0, "w": 32}
+    frames = []
+    for index in range(6):
+        name, height = f"train/{index}", 16 + index // 2
+        write_image(tmp_path / f"{name}.png", np.full((height, 32, 3), 40 * index, np.uint8))
+        frames.append(entry(orbit(0, 4), name, index / 5, **lens, h=height))
+    write_transforms(tmp_path, "train", frames)
+    found = statistics_of(tmp_path)
+    assert found.cameras == 3
 
 
 def test_a_moving_camera_tells_nothing_about_motion(tmp_path: Path) -> None:

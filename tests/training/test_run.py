@@ -18,7 +18,7 @@ from graings.capture.capture import Capture
 from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
 from graings.config import TrainConfig, make_config
-from graings.errors import CaptureError, CheckpointError
+from graings.errors import CaptureError, CheckpointError, ConfigError
 from graings.raster.photometric import photometric
 from graings.render import low_pass
 from graings.report.evaluate_run import evaluate_run
@@ -34,7 +34,7 @@ from graings.training import run_output, training_log
 from graings.training.guard.stiffness import Stiffness
 from graings.training.held_out import HeldOut
 from graings.training.run import TrainingRun
-from tests.capture.captures import write_image
+from tests.capture.captures import entry, orbit, pixels, write_image
 
 ITERATIONS = 60
 
@@ -457,6 +457,17 @@ def test_metrics_without_splits_are_named(capture: Path, tmp_path: Path) -> None
     (tmp_path / "run" / "metrics.json").write_text("{}")
     with pytest.raises(CheckpointError, match=r"metrics\.json.*splits.*--resume"):
         evaluate_run(tmp_path / "run", "val")
+
+
+def test_a_background_of_opaque_images_is_refused(tmp_path: Path) -> None:
+    """The photographs keep theirs, and no number of such views means anything."""
+    for index in range(4):
+        write_image(tmp_path / f"scene/images/{index}.png", pixels(12, 12, 3, seed=index))
+    frames = [entry(orbit(index, 4), f"images/{index}.png", index / 3) for index in range(4)]
+    (tmp_path / "scene/transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    list(TrainingRun.create(tmp_path / "scene", tmp_path / "run", _config(iterations=2)))
+    with pytest.raises(ConfigError, match="without alpha"):
+        evaluate_run(tmp_path / "run", "val", background=(0.0, 0.0, 0.0))
 
 
 def test_test_split_is_measured_only_when_asked(capture: Path, tmp_path: Path) -> None:

@@ -171,7 +171,8 @@ def _splits(
     list_file = next((file for file in (f"{model_folder}/{TEST_FILE}", TEST_FILE) if folder.has(file)), None)
     if list_file is None:
         return split_held_out(rig.frames, every, notes, source=model_folder)
-    listed = {line.strip() for line in folder.read(list_file).decode("utf-8", errors="surrogateescape").splitlines()}
+    text = folder.read(list_file).decode("utf-8-sig", errors="surrogateescape")
+    listed = {line.strip() for line in text.splitlines()}
     registered = {image.name for image in model.images}  # a few of them may be missing on disk
     unknown = sorted(listed - registered - set(rig.frames) - {""})
     if unknown:

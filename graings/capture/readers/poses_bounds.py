@@ -19,7 +19,7 @@ from graings.capture.orientation import image_scale, named_size, oriented
 from graings.capture.raw_capture import RawCapture, RawFrame
 from graings.capture.readers.array_file import read_array
 from graings.capture.readers.colmap_camera import ColmapCamera, UndistortedCameras
-from graings.capture.readers.rig import VIDEO_SUFFIXES, pictures
+from graings.capture.readers.rig import VIDEO_SUFFIXES
 from graings.capture.splits import split_held_out, time_from_name
 from graings.config import CaptureConfig
 from graings.errors import CaptureError
@@ -60,7 +60,7 @@ def _sources(folder: CaptureFolder, count: int, rig: bool) -> tuple[list[list[st
     """The files of each row, and whether the rows are cameras with several frames each, as they must be with `rig`."""
     found = []
     for place in IMAGE_FOLDERS:
-        images = pictures(folder, place)
+        images = folder.pictures(place)
         found.append(f"{len(images)} in {place}")
         if len(images) == count and not rig:
             return [[image] for image in images], False
@@ -90,7 +90,7 @@ def _sources(folder: CaptureFolder, count: int, rig: bool) -> tuple[list[list[st
 
 def _frames(folder: CaptureFolder, place: str) -> list[str]:
     """The frames of one camera, which Neural-3D-Video keeps in `images/` of its folder."""
-    return pictures(folder, place) or pictures(folder, f"{place}/images")
+    return folder.pictures(place) or folder.pictures(f"{place}/images")
 
 
 def _pose(row: NDArray[np.float64], index: int) -> tuple[NDArray[np.float64], tuple[float, float, float]]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Final
 
 from graings.capture.folder import CaptureFolder
-from graings.capture.image_file import SUFFIXES, ImageFile
+from graings.capture.image_file import ImageFile
 from graings.capture.number_in_name import notes_on_points
 from graings.capture.raw_capture import RawFrame
 from graings.capture.splits import time_from_name
@@ -43,7 +43,7 @@ def with_rig(
     found = {name: place for name, place in folders.items() if place is not None}
     if not config.rig:
         if len(found) > 1 and len(set(found.values())) == len(found):
-            count = sum(len(pictures(folder, place)) for place in found.values())
+            count = sum(len(folder.pictures(place)) for place in found.values())
             notes.append(
                 f"the images are of one instant: {count} frames of {len(found)} cameras lie in folders of their names "
                 f"({next(iter(found.values()))}, …) and are not used; set capture.rig=true to read them"
@@ -70,7 +70,7 @@ def with_rig(
                 remedy="Set capture.rig=false.",
             )
         cameras[place] = name
-        images = [_like(folder.image(picture, source=place), frame) for picture in pictures(folder, place)]
+        images = [_like(folder.image(picture, source=place), frame) for picture in folder.pictures(place)]
         timed |= {image.name: replace(frame, image=image, time=time_from_name(image.name)) for image in images}
         of_image[name] = tuple(image.name for image in images)
     if frames:
@@ -96,21 +96,9 @@ def frame_folder(folder: CaptureFolder, name: str) -> str | None:
     own = [stem, PurePosixPath(stem.name), PurePosixPath("images", stem.name)]
     inside = [stem.parent] if len(stem.parts) > 2 else []  # images/cam00/00000.png lies among the frames themselves
     for place in (*own, *inside):
-        if len(pictures(folder, str(place))) > 1:
+        if len(folder.pictures(str(place))) > 1:
             return str(place)
     return None
-
-
-def pictures(folder: CaptureFolder, place: str) -> list[str]:
-    """Names of the pictures in a folder of the capture, relative to it, sorted."""
-    path = folder.root / place
-    if not path.is_dir():
-        return []
-    return sorted(f"{place}/{file.name}" for file in path.iterdir() if _is_picture(file))
-
-
-def _is_picture(file: Path) -> bool:
-    return file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
 
 
 def _like(image: ImageFile, frame: RawFrame) -> ImageFile:

@@ -102,7 +102,7 @@ def _with_points(
     folder: CaptureFolder, content: Transforms, splits: dict[Split, tuple[RawFrame, ...]], file: str, notes: list[str]
 ) -> RawCapture:
     """The capture with the points of `ply_file_path`, which have the axes and the unit of the poses."""
-    if content.ply_file_path is None:
+    if not content.ply_file_path:
         return RawCapture("transforms", splits, tuple(notes))
     name = folder.find(content.ply_file_path, source=file, field="ply_file_path") or content.ply_file_path
     return RawCapture.with_points("transforms", splits, notes, *read_ply(name, folder.read(name)))

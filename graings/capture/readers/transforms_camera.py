@@ -21,7 +21,7 @@ from graings.capture.readers.colmap_camera import (
 )
 from graings.errors import CaptureError
 
-Angle = Annotated[float, Field(gt=0, lt=math.pi)]
+Angle = Annotated[float, Field(ge=1e-6, lt=math.pi)]
 Length = Annotated[float, Field(gt=0)]
 Coefficient = Literal["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "sx1", "sy1", "omega"]
 
