@@ -118,7 +118,10 @@ def evaluate(
     split: Annotated[Literal["val", "test", "between"], typer.Option(help="Held-out views to evaluate.")] = "val",
     capture: Annotated[Path | None, typer.Option(help="Folder of the capture, if it was moved since training.")] = None,
     background: Annotated[
-        str | None, typer.Option(help="white, black, #rrggbb or r,g,b instead of that of training; prints only.")
+        str | None,
+        typer.Option(
+            help="white, black, #rrggbb or r,g,b for images with alpha, instead of that of training; prints only."
+        ),
     ] = None,
     threads: Threads = None,
 ) -> None:
