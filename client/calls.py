@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,7 +85,7 @@ def submit(
 def job_name(name: str | None, capture: Path | str) -> str:
     """The name of a job: that of its capture unless another is given, as long as the service takes it."""
     path = Path(capture).resolve()
-    title = path.name if path.is_dir() else path.stem.removesuffix(".tar")
+    title = path.name if os.path.isdir(path) else path.stem.removesuffix(".tar")  # of a path too long to exist, too
     return (name or title)[:NAME_LENGTH]
 
 

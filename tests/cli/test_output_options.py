@@ -142,7 +142,7 @@ def test_a_vertical_axis_is_refused_for_a_model_which_has_its_own(model: Path, c
 def test_a_rate_that_gif_does_not_have_is_refused_before_the_model_is_read(tmp_path: Path) -> None:
     code, text = answer("video", tmp_path / "absent", "-o", tmp_path / "a.gif", "--fps", 120)
     assert code == 2
-    assert "fps must lie in (0, 100] for a .gif file" in text
+    assert "fps must lie in [0.1, 100] for a .gif file" in text
 
 
 @pytest.mark.parametrize(("suffix", "size"), [(".mp4", "32 x 20"), (".gif", "33 x 21")])

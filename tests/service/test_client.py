@@ -270,9 +270,10 @@ def test_another_program_at_the_address_is_an_error_with_the_address(body: str, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_capture_is_named(remote: Client, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["nowhere", "nowhere" * 100])
+def test_a_missing_capture_is_named(remote: Client, tmp_path: Path, name: str) -> None:
     with pytest.raises(ClientError, match="nowhere"):
-        remote.submit(tmp_path / "nowhere")
+        remote.submit(tmp_path / name)
 
 
 def test_the_client_imports_neither_torch_nor_graings() -> None:
