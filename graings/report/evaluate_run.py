@@ -46,12 +46,14 @@ def evaluate_run(
         )
     frames = data.split(split)
     # Before the views are rendered: what cannot be read is told in a second.
-    document, trajectories = read_metrics(run / METRICS_FILE), read_trajectories(data.root)
+    read_metrics(run / METRICS_FILE)
+    trajectories = read_trajectories(data.root)
     color = model.background if background is None else background
     images = ImageStore(color, model.config.capture.cache_mb)
     metrics = evaluate(model.scene, frames, images, color, distances=PerceptualDistances.find())
     if background is not None:
         return metrics
+    document = read_metrics(run / METRICS_FILE)  # again: another evaluation may have added its split meanwhile
     update = {"splits": {**document.splits, split: metrics}, "motion": _motion(model, data, trajectories)}
     write_document(run / METRICS_FILE, document.model_copy(update=update))
     return metrics

@@ -19,8 +19,10 @@ from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
 from graings.config import TrainConfig, make_config
 from graings.errors import CaptureError, CheckpointError, ConfigError
+from graings.evaluation.metrics import SplitMetrics
 from graings.raster.photometric import photometric
 from graings.render import low_pass
+from graings.report import evaluate_run as evaluate_module
 from graings.report.evaluate_run import evaluate_run
 from graings.report.events import Stiff
 from graings.report.machine import version_facts
@@ -468,6 +470,24 @@ def test_a_background_of_opaque_images_is_refused(tmp_path: Path) -> None:
     list(TrainingRun.create(tmp_path / "scene", tmp_path / "run", _config(iterations=2)))
     with pytest.raises(ConfigError, match="without alpha"):
         evaluate_run(tmp_path / "run", "val", background=(0.0, 0.0, 0.0))
+
+
+def test_a_split_that_was_added_during_an_evaluation_is_kept(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    list(TrainingRun.create(capture, tmp_path / "run", _config(iterations=2)))
+    measure = evaluate_module.evaluate
+    began: list[str] = []
+
+    def evaluate(*arguments: Any, **more: Any) -> SplitMetrics:
+        if not began:
+            began.append("test")
+            evaluate_run(tmp_path / "run", "test")
+        return measure(*arguments, **more)
+
+    monkeypatch.setattr(evaluate_module, "evaluate", evaluate)
+    evaluate_run(tmp_path / "run", "val")
+    assert set(read_metrics(tmp_path / "run" / "metrics.json").splits) == {"val", "test"}
 
 
 def test_test_split_is_measured_only_when_asked(capture: Path, tmp_path: Path) -> None:
