@@ -35,7 +35,11 @@ class Row:
 
 ROWS = (
     Row("printed", "the method as printed", ()),
-    Row("batch", "four views a step, short warm-up, growth every 50 steps", ("batch", "warmup", "density.grow_every")),
+    Row(
+        "batch",
+        "four views a step, short warm-up, growth every 50 steps, products of networks in bfloat16 where the CPU can",
+        ("batch", "warmup", "density.grow_every", "network_precision"),
+    ),
     Row("time", "time conditioning factorized", ("scene.time_conditioning",)),
     Row(
         "losses",

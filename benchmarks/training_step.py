@@ -3,7 +3,9 @@
     python benchmarks/training_step.py RUN [--steps 50] [--threads 2] [--batch 1]
 
 Continues the run in memory (nothing is written) and measures each part of a step separately. Drawing, loss and backward
-pass run view by view, whereas a real step draws all views first. The last line is the time of `Trainer.step` itself.
+pass run view by view, whereas a real step draws all views first. The last lines are the time of `Trainer.step` itself
+with the networks' products in float32 and, where the CPU has instructions for it, in bfloat16: blocks of steps of both
+in turn.
 """
 
 from __future__ import annotations
@@ -19,9 +21,12 @@ import torch
 from graings import kernel
 from graings.raster.photometric import photometric
 from graings.render import draw
+from graings.scene.perceptron import bfloat16_products
 from graings.training.guard.guard import Gradient
 from graings.training.run import TrainingRun
 from graings.training.trainer import Trainer
+
+BLOCKS = 4  # of steps with the same precision
 
 
 class Stopwatch:
@@ -57,7 +62,8 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
     for view in trainer.views.upcoming(trainer.iteration):
         trainer.images.prefetch(trainer.pyramid.at(trainer.iteration + 1).frames[view])
     watch.lap("images")
-    compositions = trainer.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
+    with bfloat16_products(trainer.rounds_products):
+        compositions = trainer.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
     watch.lap("scene forward")
     leaves, grads, screen = [], [], []
     for frame, target, composition in zip(frames, targets, compositions, strict=True):
@@ -75,7 +81,8 @@ def measured_step(trainer: Trainer, watch: Stopwatch) -> int:
         leaves += own
         grads += raster_gradients
         screen.append((at_centres, result.radii.amax(-1) > 0))
-    regulariser = trainer.objective.regularisers(trainer.scene, compositions, [frame.time for frame in frames])
+    with bfloat16_products(trainer.rounds_products):
+        regulariser = trainer.objective.regularisers(trainer.scene, compositions, [frame.time for frame in frames])
     watch.lap("regularisers forward (a second time of DeformNet)")
     torch.autograd.backward(
         [*leaves, *([regulariser] if regulariser.requires_grad else [])],
@@ -115,16 +122,20 @@ def measure(run: TrainingRun, steps: int, batch: int | None) -> None:
     trainer = run._trainer
     if batch is not None:
         trainer.config = trainer.config.model_copy(update={"batch": batch})
-    trainer.iteration = min(trainer.iteration, run.iterations - 2 * steps - 10)
+    trainer.iteration = min(trainer.iteration, run.iterations - 3 * steps - 20)
     for _ in range(5):
         trainer.step()
     watch = Stopwatch()
     counts = [measured_step(trainer, watch) for _ in range(steps)]
-    whole = []
-    for _ in range(steps):
-        started = time.perf_counter()
-        trainer.step()
-        whole.append(1e3 * (time.perf_counter() - started))
+    before = trainer.rounds_products
+    whole: dict[bool, list[float]] = {False: []} | ({True: []} if kernel.bfloat16_products() else {})
+    for trainer.rounds_products in [*whole] * BLOCKS:
+        trainer.step()  # allocates memory for activations of the other size
+        for _ in range(steps // BLOCKS):
+            started = time.perf_counter()
+            trainer.step()
+            whole[trainer.rounds_products].append(1e3 * (time.perf_counter() - started))
+    trainer.rounds_products = before
     camera = run.capture.train[0].camera
     print(
         f"{camera.width}x{camera.height} px, iteration {trainer.iteration}, {statistics.median(counts):.0f} drawn, "
@@ -137,7 +148,9 @@ def measure(run: TrainingRun, steps: int, batch: int | None) -> None:
         total += median
         print(f"{median:8.2f} ms  {name}")
     print(f"{total:8.2f} ms  sum of the parts")
-    print(f"{statistics.median(whole):8.2f} ms  Trainer.step")
+    for rounded, values in whole.items():
+        precision = f"bfloat16 ({kernel.bfloat16_products()})" if rounded else "float32"
+        print(f"{statistics.median(values):8.2f} ms  Trainer.step, products of networks in {precision}")
 
 
 if __name__ == "__main__":

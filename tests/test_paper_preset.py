@@ -88,6 +88,7 @@ CONSTANTS: Final[tuple[tuple[str, str, Any, Any], ...]] = (
 READINGS: Final[dict[str, Any]] = {
     "batch": 1,
     "matrix_optimizer": "adam",
+    "network_precision": "float32",
     "capture.max_side": 800,
     "capture.background": "white",
     "scene.blur": 0.3,

@@ -51,6 +51,7 @@ PRESETS: Final[dict[str, dict[str, Any]]] = {
         "time_window": 1.0,
         "low_resolution_until": 0,
         "matrix_optimizer": "adam",
+        "network_precision": "float32",
         "capture": {"max_side": 800, "background": "white"},
         "scene": {
             "children": 10,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -51,6 +51,10 @@ class Calibration(Document):
     deformation: Seconds = Field(description="Further CPU seconds of the deformation, once a step, of a million.")
     deformation_view: Seconds = Field(description="The same, once a view.")
     residual_view: Seconds = Field(description="Further CPU seconds of the residual, once a view, of a million.")
+    float32: float = Field(
+        gt=0,
+        description="Times of Gaussians with the networks' products in float32, over these; 1 where these are that.",
+    )
     wall_over_cpu: float = Field(gt=0, description="Wall-clock time of a step over its CPU time.")
     error: float = Field(ge=0, description="Root mean square relative error of these times on the calibrating steps.")
     cost_s: Seconds = Field(description="CPU seconds that the calibration took.")
@@ -111,8 +115,9 @@ def predict(statistics: CaptureStatistics, config: TrainConfig, calibration: Cal
 
     Steps only: making the first anchors is not part of it.
     """
+    slower = calibration.float32 if config.network_precision == "float32" else 1.0
     loads = _loads(statistics, config)
-    cpu_s = sum(steps * _seconds(calibration, load) for steps, load in loads)
+    cpu_s = sum(steps * _seconds(calibration, load, slower) for steps, load in loads)
     return Prediction(
         cpu_s=cpu_s,
         minutes=cpu_s * calibration.wall_over_cpu / 60.0,
@@ -121,7 +126,8 @@ def predict(statistics: CaptureStatistics, config: TrainConfig, calibration: Cal
     )
 
 
-def _seconds(calibration: Calibration, load: Load) -> float:
+def _seconds(calibration: Calibration, load: Load, slower: float) -> float:
+    load = replace(load, gaussians=slower * load.gaussians)
     return sum(getattr(calibration, name) * factor for name, factor in zip(TERMS, load.terms(), strict=True))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,10 @@ class MachineFacts(Document):
     architecture: str = Field(description="Machine architecture, such as x86_64.")
     kernel_isa: str | None = Field(
         description="Instruction set of the compiled rasterizer; null where only the reference implementation runs."
+    )
+    bfloat16_products: str | None = Field(
+        description="Instructions for products in bfloat16, amx or avx512bf16, that networks train with unless an "
+        "option says otherwise; null where there are none."
     )
     torch_cpu_capability: str = Field(description="Instruction set that torch uses.")
     threads: int = Field(gt=0, description="CPU threads that were used.")
@@ -56,7 +61,8 @@ def machine_facts(threads: int | None = None) -> MachineFacts:
         ram_gb=round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
         os=f"{platform.system()} {platform.release()}",
         architecture=platform.machine(),
-        kernel_isa=_kernel_isa(),
+        kernel_isa=_of_kernel(kernel.active_isa),
+        bfloat16_products=_of_kernel(kernel.bfloat16_products),
         torch_cpu_capability=torch.backends.cpu.get_cpu_capability(),
         threads=threads if threads is not None else kernel.thread_count(),
     )
@@ -73,10 +79,10 @@ def version_facts() -> VersionFacts:
     )
 
 
-def _kernel_isa() -> str | None:
-    """Instruction set of the compiled kernel, or None where only the reference implementation can draw."""
+def _of_kernel(fact: Callable[[], str | None]) -> str | None:
+    """A fact about the compiled kernel, or None where only the reference implementation can draw."""
     try:
-        return kernel.active_isa()
+        return fact()
     except KernelError:
         return None
 

@@ -6,7 +6,8 @@ layers while it is in the cache.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -16,6 +17,22 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from graings import kernel
+
+_bfloat16 = False
+
+
+@contextmanager
+def bfloat16_products(enabled: bool = True) -> Iterator[None]:
+    """Inside the context `perceptron` rounds the factors of its products to bfloat16, in both passes.
+
+    Sums, biases and outputs stay float32. Where `kernel.bfloat16_products()` is None `perceptron` raises `ValueError`.
+    """
+    global _bfloat16
+    before, _bfloat16 = _bfloat16, enabled
+    try:
+        yield
+    finally:
+        _bfloat16 = before
 
 
 class GroupBias(NamedTuple):
@@ -61,7 +78,8 @@ def perceptron(
         tensors.append(shared.values)
     if any(t.dtype != dtype or t.device.type != "cpu" for t in tensors):
         raise ValueError(f"inputs, weights, biases and shared values must all be {dtype} on the CPU")
-    values: Tensor = _Perceptron.apply(kernel.thread_count(), groups, *tensors)  # type: ignore[no-untyped-call]
+    bfloat16 = _bfloat16 and dtype == torch.float32
+    values: Tensor = _Perceptron.apply(kernel.thread_count(), bfloat16, groups, *tensors)  # type: ignore[no-untyped-call]
     return values
 
 
@@ -89,17 +107,18 @@ def weights_and_biases(layers: Iterable[nn.Module]) -> tuple[list[Tensor], list[
 
 class _Perceptron(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, threads: int, groups: Tensor | None, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, threads: int, bfloat16: bool, groups: Tensor | None, *tensors: Tensor) -> Tensor:
         contiguous = [t.detach().contiguous() for t in tensors]
         inputs, weights, biases, shared = _unpacked(contiguous)
         groups = None if groups is None else groups.contiguous()
         output = inputs.new_empty(len(inputs), len(biases[-1]))
         hidden: Tensor | None = None
         if any(ctx.needs_input_grad):
-            hidden = inputs.new_empty(kernel.call("hidden_size", [inputs.shape[1], *map(len, biases)], len(inputs)))
+            widths = [inputs.shape[1], *map(len, biases)]
+            hidden = inputs.new_empty(kernel.call("hidden_size", widths, len(inputs), bfloat16))
             ctx.save_for_backward(hidden, groups, *contiguous)
-            ctx.threads = threads
-        kernel.call("network", inputs, weights, biases, shared, groups, output, hidden, threads)
+            ctx.bfloat16, ctx.threads = bfloat16, threads
+        kernel.call("network", inputs, weights, biases, shared, groups, output, hidden, bfloat16, threads)
         return output
 
     @staticmethod
@@ -107,12 +126,13 @@ class _Perceptron(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         hidden, groups, *tensors = ctx.saved_tensors
         inputs, weights, biases, shared = _unpacked(tensors)
-        v_inputs = torch.empty_like(inputs) if ctx.needs_input_grad[2] else None
+        v_inputs = torch.empty_like(inputs) if ctx.needs_input_grad[3] else None
         v_shared = None if shared is None else torch.empty_like(shared)
         v_weights, v_biases = [torch.empty_like(w) for w in weights], [torch.empty_like(b) for b in biases]
         layers, gradients = (inputs, weights, biases, shared, groups), (v_inputs, v_weights, v_biases, v_shared)
-        kernel.call("network_gradient", *layers, hidden, upstream.contiguous(), *gradients, ctx.threads)
-        return None, None, v_inputs, *v_weights, *v_biases, *([] if v_shared is None else [v_shared])
+        upstream = upstream.contiguous()
+        kernel.call("network_gradient", *layers, hidden, upstream, *gradients, ctx.bfloat16, ctx.threads)
+        return None, None, None, v_inputs, *v_weights, *v_biases, *([] if v_shared is None else [v_shared])
 
 
 def _unpacked(tensors: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor], Tensor | None]:

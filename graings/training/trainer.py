@@ -30,6 +30,7 @@ from graings.report.events import (
     StepSkipped,
 )
 from graings.report.start_events import BackgroundFound, LowResolutionStarted, MotionFound, TimeWindowStarted
+from graings.scene.perceptron import bfloat16_products
 from graings.scene.scene import Composition, Scene
 from graings.training.guard.collapse import RESET_OPACITY, raise_opacity
 from graings.training.guard.guard import Gradient, Guard, StepCheck, first_not_finite
@@ -71,7 +72,8 @@ class Trainer(TrainerState):
             self.images.prefetch(frame)
 
         # compose the Gaussians of each view at its time, and draw them
-        compositions = self.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
+        with bfloat16_products(self.rounds_products):
+            compositions = self.scene.compose_together([(frame.camera.center, frame.time) for frame in frames])
         drawn = len(compositions[0].children)
         offsets = [torch.zeros(drawn, 2, requires_grad=True) for _ in frames]
         results = [
@@ -80,7 +82,8 @@ class Trainer(TrainerState):
         ]
 
         # losses and gradients; with nothing drawn and no regulariser there is nothing to differentiate
-        loss = self.objective(self.scene, frames, compositions, results, self.iteration)
+        with bfloat16_products(self.rounds_products):
+            loss = self.objective(self.scene, frames, compositions, results, self.iteration)
         if loss.total.requires_grad:
             loss.total.backward()
 

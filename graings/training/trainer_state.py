@@ -21,6 +21,7 @@ from graings.training.guard.collapse import Collapse
 from graings.training.guard.guard import Guard
 from graings.training.guard.snapshots import Snapshots
 from graings.training.initialization.initial_scene import make_scene
+from graings.training.network_precision import rounds_products
 from graings.training.objective import Objective
 from graings.training.optimizer import Optimizer
 from graings.training.parameter_average import ParameterAverage
@@ -68,6 +69,7 @@ class TrainerState:
         self.notes = tuple(notes)
         self.iteration = 0
         self.background = config.capture.background_rgb()
+        self.rounds_products = rounds_products(config)
         self.phases = phases(config)
         self.tracks = tracks
         self.objective = Objective(config, images, capture.times, streams, tracks)

@@ -44,6 +44,7 @@ MADE = Calibration(
     deformation=0.1,
     deformation_view=0.1,
     residual_view=0.1,
+    float32=2.0,
     wall_over_cpu=0.6,
     error=0.1,
     cost_s=1.0,

@@ -27,6 +27,7 @@ MADE = Calibration(
     deformation=3.0,
     deformation_view=0.4,
     residual_view=0.4,
+    float32=2.0,
     wall_over_cpu=0.9,
     error=0.1,
     cost_s=5.0,
@@ -85,6 +86,14 @@ def test_the_cost_grows_with_steps_views_pixels_and_detail() -> None:
     assert cost(batch=8) > plain > cost({"pixels": 1_024}) > 0
     assert cost({"detail": 0.9}) > plain
     assert cost(**{"scene.deformation": "none", "scene.residual": False}) < plain
+
+
+def test_networks_in_float32_cost_what_the_calibration_found() -> None:
+    def cost(precision: str) -> float:
+        return predict(FACTS, make_config("standard", {"network_precision": precision}), MADE).cpu_s
+
+    assert cost("auto") == cost("bfloat16")
+    assert cost("auto") < cost("float32") < MADE.float32 * cost("auto")
 
 
 def test_what_a_plan_drops_makes_the_training_cheaper_by_what_it_says() -> None:

@@ -54,6 +54,13 @@ graings::NetworkOutputs<R> network_outputs(const In<R>& canonical, const In<R>& 
 }
 
 template <class R>
+graings::Products products_in(bool bfloat16) {
+    if (bfloat16 && !std::is_same_v<R, float>) throw std::invalid_argument("products in bfloat16 are for float32");
+    if (bfloat16) graings::bfloat16_kernels();  // throws where there are none
+    return bfloat16 ? graings::kInBfloat16 : graings::kAsStored;
+}
+
+template <class R>
 void bind_children(nb::module_& m) {
     m.def("gather", [](In<R> position, In<R> log_scale, In<R> offset, In<int64_t> children, Out<R> row, Out<R> centre, Out<R> base, int threads) {
         const auto from = anchors<R>(position, log_scale, offset);
@@ -163,21 +170,23 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
         graings::encode_directions_gradient<R>(int64_t(rows), degree, from, at, upstream, out, threads);
     });
     m.def("network", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, std::optional<In<R>> shared, std::optional<In<int64_t>> group,
-                        Out<R> output, std::optional<Out<R>> hidden, int threads) {
+                        Out<R> output, std::optional<Out<R>> hidden, bool bfloat16, int threads) {
         const int64_t rows = int64_t(input.shape(0));
         const auto layers = network<R>(input, rows, weights, biases, shared, group);
         R* out = checked(output, size_t(rows * layers.widths.back()), "output");
-        R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows)), "hidden");
+        const auto products = products_in<R>(bfloat16);
+        R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows, products)), "hidden");
         nb::gil_scoped_release release;
-        graings::evaluate<R>(layers, rows, input.data(), out, kept, threads);
+        graings::evaluate<R>(layers, rows, input.data(), out, kept, products, threads);
     });
     m.def("network_gradient", [](In<R> input, std::vector<In<R>> weights, std::vector<In<R>> biases, std::optional<In<R>> shared, std::optional<In<int64_t>> group,
                                  Out<R> hidden, In<R> v_output, std::optional<Out<R>> v_input, std::vector<Out<R>> v_weights, std::vector<Out<R>> v_biases,
-                                 std::optional<Out<R>> v_shared, int threads) {
+                                 std::optional<Out<R>> v_shared, bool bfloat16, int threads) {
         const int64_t rows = int64_t(input.shape(0));
         const auto layers = network<R>(input, rows, weights, biases, shared, group);
         const R* upstream = checked(v_output, size_t(rows * layers.widths.back()), "v_output");
-        R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows)), "hidden");
+        const auto products = products_in<R>(bfloat16);
+        R* kept = checked(hidden, size_t(graings::hidden_size(layers.widths, rows, products)), "hidden");
         R *v_in = checked(v_input, input.size(), "v_input"), *v_common = checked(v_shared, shared ? shared->size() : 0, "v_shared");
         if (shared && !v_shared) throw std::invalid_argument("shared needs v_shared for its gradient");
         if (v_weights.size() != weights.size() || v_biases.size() != weights.size()) throw std::invalid_argument("one gradient per weight and bias");
@@ -187,7 +196,7 @@ void bind(nb::module_& m, const char* frame_name, const char* draw_name) {
             b.push_back(checked(v_biases[l], biases[l].size(), "bias gradient"));
         }
         nb::gil_scoped_release release;
-        graings::differentiate<R>(layers, rows, input.data(), kept, upstream, v_in, w, b, v_common, threads);
+        graings::differentiate<R>(layers, rows, input.data(), kept, upstream, v_in, w, b, v_common, products, threads);
     });
     m.def("compare", [](In<R> image, In<R> target, int64_t height, int64_t width, double similarity, double absolute, double squared, std::optional<Out<R>> gradient, int threads) {
         const size_t size = size_t(3 * height * width);
@@ -211,7 +220,12 @@ NB_MODULE(_kernel, m) {
     bind_children<float>(m);
     bind_children<double>(m);
     bind_prepared(m);
-    m.def("hidden_size", &graings::hidden_size, "widths"_a, "rows"_a, "Elements that a network's hidden activations take.");
+    m.def("hidden_size", [](const std::vector<int64_t>& widths, int64_t rows, bool bfloat16) {
+        return graings::hidden_size(widths, rows, bfloat16 ? graings::kInBfloat16 : graings::kAsStored);
+    }, "widths"_a, "rows"_a, "bfloat16"_a, "Elements that a network's hidden activations take.");
+    m.def("bfloat16_products", &graings::bfloat16_products, "Instructions for products in bfloat16: amx, avx512bf16, or an empty string.");
+    m.def("available_bfloat16_products", &graings::available_bfloat16_products, "Instructions for products in bfloat16 that this CPU has, best first.");
+    m.def("use_bfloat16_products", &graings::use_bfloat16_products, "name"_a, "Uses these instructions for products in bfloat16 for the whole process.");
     m.def("ssim_constants", [] {
         nb::dict constants;
         constants["taps"] = std::vector<double>(std::begin(graings::kSsimTaps), std::end(graings::kSsimTaps));

@@ -17,17 +17,21 @@ struct Network {
     int64_t groups = 0;
 };
 
+// Whether products are of the numbers as they are, or of numbers rounded to bfloat16; the latter for float32 and where
+// bfloat16_products() (isa.hpp) names instructions for it.
+enum Products { kAsStored, kInBfloat16 };
+
 // Number of elements of the hidden activations of so many rows.
-int64_t hidden_size(const std::vector<int64_t>& widths, int64_t rows);
+int64_t hidden_size(const std::vector<int64_t>& widths, int64_t rows, Products);
 
 // output [rows, widths.back()] of input [rows, widths.front()]. `hidden` may be null if no gradient is needed.
 // Throws std::invalid_argument if groups do not ascend within their count.
 template <class R>
-void evaluate(const Network<R>&, int64_t rows, const R* input, R* output, R* hidden, int threads);
+void evaluate(const Network<R>&, int64_t rows, const R* input, R* output, R* hidden, Products, int threads);
 
-// Gradients for `v_output`, with `hidden` as evaluate left it; `v_input` may be null, and `v_shared` if
+// Gradients for `v_output`, with `hidden` as evaluate left it for the same products; `v_input` may be null, and `v_shared` if
 // `shared` is. The same bits for any number of threads.
 template <class R>
-void differentiate(const Network<R>&, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, R* v_shared, int threads);
+void differentiate(const Network<R>&, int64_t rows, const R* input, R* hidden, const R* v_output, R* v_input, const std::vector<R*>& v_weights, const std::vector<R*>& v_biases, R* v_shared, Products, int threads);
 
 }  // namespace graings

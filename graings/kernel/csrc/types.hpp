@@ -164,15 +164,23 @@ constexpr int64_t kNetworkRows = 64;  // rows per block: their activations fit i
 constexpr int64_t kNetworkPad = 16;   // widths are padded to a multiple of this
 constexpr int64_t kPanel = 32;        // weights are stored in panels of this many columns, row by row
 
-// A network packed for the loops. Level 0 is the input, level `layers` the output.
-template <class R>
+// Upper half of a float32. Products of such numbers are exact in float32, in which they are summed.
+enum Bfloat16 : uint16_t {};
+
+// Networks in bfloat16: weights are stored in tiles of kTileColumns columns and kTileDepth rows, of which two at a time are
+// interleaved, as the instructions take them. Widths are padded to a multiple of kTileDepth.
+constexpr int64_t kTileColumns = 16, kTileDepth = 32;
+
+// A network packed for the loops. Level 0 is the input, level `layers` the output. Weights and hidden levels are stored as
+// `Stored`.
+template <class R, class Stored = R>
 struct NetworkArgs {
     int layers;
     int64_t widths[kMaxLayers + 1], padded[kMaxLayers + 1], widest;
-    int64_t offsets[kMaxLayers + 2];  // of each level's activations in the scratch memory, then of two gradients
+    int64_t offsets[kMaxLayers + 2];  // of each level's activations in the scratch memory, then of what follows them
     int64_t weight_at[kMaxLayers], bias_at[kMaxLayers];  // offsets in a set of partial sums
-    const R* forward[kMaxLayers];   // [in, out], in panels
-    const R* backward[kMaxLayers];  // [out, in], in panels; only for the gradient
+    const Stored* forward[kMaxLayers];   // [in, out], in panels or tiles
+    const Stored* backward[kMaxLayers];  // [out, in], in panels or tiles; only for the gradient
     const R* biases[kMaxLayers];
     const R *input, *v_output;
     R *output, *v_input;  // v_input may be null
@@ -180,7 +188,7 @@ struct NetworkArgs {
     const int64_t* groups;  // of each row, ascending
     R* v_shared;
     int64_t first_group_at;  // offset in a set of partial sums: the part of a group that began in an earlier piece
-    R* hidden;            // the hidden levels of every block, kept for the gradient; may be null
+    Stored* hidden;       // the hidden levels of every block, kept for the gradient; may be null
 };
 
 constexpr int kMoving = 16;    // children per block of the arrays of MoveArgs
@@ -228,6 +236,12 @@ struct Kernels {
     void (*finish_colors)(int64_t count, R bound, const R* residual, R* colors);  // residual may be null
     void (*move_children)(const MoveArgs<R>&, int64_t begin, int64_t end);
     void (*blend_children)(const BlendArgs<R>&, int64_t begin, int64_t end);  // blocks
+};
+
+// Networks whose weights and activations are rounded to bfloat16 for every product, compiled for CPUs with such instructions.
+struct Bfloat16Kernels {
+    void (*network_values)(const NetworkArgs<float, Bfloat16>&, int64_t begin, int64_t end, float* scratch);
+    void (*network_gradient)(const NetworkArgs<float, Bfloat16>&, int64_t begin, int64_t end, float* sums, float* scratch);
 };
 
 constexpr int kChunk = 64;  // entries of a tile prepared at a time in the forward pass
