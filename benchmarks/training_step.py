@@ -4,7 +4,7 @@
 
 Continues the run in memory (nothing is written) and measures each part of a step separately. Drawing, loss and backward
 pass run view by view, whereas a real step draws all views first. The last lines are the time of `Trainer.step` itself
-with the networks' products in float32 and, where the CPU has instructions for it, in bfloat16: blocks of steps of both
+with the networks' products in float32 and, where the CPU has AMX, in bfloat16: blocks of steps of both
 in turn.
 """
 
@@ -128,7 +128,7 @@ def measure(run: TrainingRun, steps: int, batch: int | None) -> None:
     watch = Stopwatch()
     counts = [measured_step(trainer, watch) for _ in range(steps)]
     before = trainer.rounds_products
-    whole: dict[bool, list[float]] = {False: []} | ({True: []} if kernel.bfloat16_products() else {})
+    whole: dict[bool, list[float]] = {False: []} | ({True: []} if kernel.has_bfloat16_products() else {})
     for trainer.rounds_products in [*whole] * BLOCKS:
         trainer.step()  # allocates memory for activations of the other size
         for _ in range(steps // BLOCKS):
@@ -149,7 +149,7 @@ def measure(run: TrainingRun, steps: int, batch: int | None) -> None:
         print(f"{median:8.2f} ms  {name}")
     print(f"{total:8.2f} ms  sum of the parts")
     for rounded, values in whole.items():
-        precision = f"bfloat16 ({kernel.bfloat16_products()})" if rounded else "float32"
+        precision = "bfloat16" if rounded else "float32"
         print(f"{statistics.median(values):8.2f} ms  Trainer.step, products of networks in {precision}")
 
 

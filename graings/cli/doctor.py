@@ -20,7 +20,7 @@ from rich.text import Text
 from graings.colmap import pycolmap_remedy
 from graings.errors import GraingsError
 from graings.evaluation.perceptual import PerceptualDistances
-from graings.kernel import active_isa, available_isas, bfloat16_products
+from graings.kernel import active_isa, available_isas, has_bfloat16_products
 from graings.kernel.threads import usable_cores
 
 # What is wrong: nothing, something that only some uses need, or something that everything needs.
@@ -59,8 +59,7 @@ def _machine() -> Iterable[Check]:
     yield "python", "ok", f"{platform.python_version()} on {platform.machine()}, {usable_cores()} usable cores"
     yield "graings", "ok", f"{version('graings')}, torch {torch.__version__}"
     try:
-        rounded = bfloat16_products()
-        networks = f"networks train in bfloat16 ({rounded})" if rounded else "networks train in float32"
+        networks = f"networks train in {'bfloat16 (AMX)' if has_bfloat16_products() else 'float32'}"
         yield "kernel", "ok", f"uses {active_isa()} of {', '.join(available_isas())}; {networks}"
     except (GraingsError, ImportError) as error:
         yield "kernel", "broken", f"{error} Install it again with a C++20 compiler: scripts/setup"

@@ -67,8 +67,8 @@ class TrainConfig(ConfigSection):
     network_precision: Literal["auto", "bfloat16", "float32"] = Field(
         "auto",
         description="Precision of the factors of the networks' products in training. bfloat16: rounded, summed in "
-        "float32, two to three times as fast; an error where the CPU has no such instructions (AMX or AVX512-BF16). "
-        "auto: bfloat16 where the CPU has them, else float32. Evaluation and rendering always use float32.",
+        "float32, two to three times as fast; an error where the CPU has no AMX. "
+        "auto: bfloat16 where the CPU has it, else float32. Evaluation and rendering always use float32.",
     )
     seed: int = Field(0, ge=0, lt=2**31, description="Seed of all random streams.")
     threads: int | None = Field(None, ge=1, le=256, description="Number of CPU threads; null: all cores.")

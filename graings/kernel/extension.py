@@ -67,22 +67,9 @@ def available_isas() -> tuple[str, ...]:
     return tuple(kernel().available_isas())
 
 
-def bfloat16_products() -> str | None:
-    """Name of the instructions for products in bfloat16: amx or avx512bf16; None where this CPU has none.
-
-    None also where another instruction set than avx512 is in use.
-    """
-    return str(kernel().bfloat16_products()) or None
-
-
-def available_bfloat16_products() -> tuple[str, ...]:
-    """Instructions for products in bfloat16 that this CPU has, best first."""
-    return tuple(kernel().available_bfloat16_products())
-
-
-def use_bfloat16_products(name: str) -> None:
-    """Select them for the whole process. Raises `ValueError` if this CPU does not have them."""
-    kernel().use_bfloat16_products(name)
+def has_bfloat16_products() -> bool:
+    """Whether networks can have products in bfloat16 here: with AMX, and where avx512 is the instruction set in use."""
+    return bool(kernel().has_bfloat16_products())
 
 
 def use_isa(name: str) -> None:

@@ -7,6 +7,7 @@ import platform
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,6 +17,8 @@ import graings
 from graings import kernel
 from graings.document import Document
 from graings.errors import KernelError
+
+Fact = TypeVar("Fact", str, bool)
 
 
 class MachineFacts(Document):
@@ -31,9 +34,8 @@ class MachineFacts(Document):
     kernel_isa: str | None = Field(
         description="Instruction set of the compiled rasterizer; null where only the reference implementation runs."
     )
-    bfloat16_products: str | None = Field(
-        description="Instructions for products in bfloat16, amx or avx512bf16, that networks train with unless an "
-        "option says otherwise; null where there are none."
+    bfloat16_products: bool | None = Field(
+        description="Whether networks can train with products in bfloat16 (AMX); null without the compiled kernel."
     )
     torch_cpu_capability: str = Field(description="Instruction set that torch uses.")
     threads: int = Field(gt=0, description="CPU threads that were used.")
@@ -62,7 +64,7 @@ def machine_facts(threads: int | None = None) -> MachineFacts:
         os=f"{platform.system()} {platform.release()}",
         architecture=platform.machine(),
         kernel_isa=_of_kernel(kernel.active_isa),
-        bfloat16_products=_of_kernel(kernel.bfloat16_products),
+        bfloat16_products=_of_kernel(kernel.has_bfloat16_products),
         torch_cpu_capability=torch.backends.cpu.get_cpu_capability(),
         threads=threads if threads is not None else kernel.thread_count(),
     )
@@ -79,7 +81,7 @@ def version_facts() -> VersionFacts:
     )
 
 
-def _of_kernel(fact: Callable[[], str | None]) -> str | None:
+def _of_kernel(fact: Callable[[], Fact]) -> Fact | None:
     """A fact about the compiled kernel, or None where only the reference implementation can draw."""
     try:
         return fact()

@@ -25,7 +25,7 @@ _bfloat16 = False
 def bfloat16_products(enabled: bool = True) -> Iterator[None]:
     """Inside the context `perceptron` rounds the factors of its products to bfloat16, in both passes.
 
-    Sums, biases and outputs stay float32. Where `kernel.bfloat16_products()` is None `perceptron` raises `ValueError`.
+    Sums, biases and outputs stay float32. Without `kernel.has_bfloat16_products()`, `perceptron` raises `ValueError`.
     """
     global _bfloat16
     before, _bfloat16 = _bfloat16, enabled

@@ -13,18 +13,14 @@ from graings import kernel
 from graings.scene.perceptron import GroupBias, bfloat16_products, perceptron, plain_perceptron
 from tests.scene.test_perceptron import CHAINS, ROWS, Chain, chain, gamma, in_groups, upstream, with_threads
 
-NONE = pytest.param("", marks=pytest.mark.skip(reason="this CPU has no instructions for products in bfloat16"))
+needs_amx = pytest.mark.skipif(not kernel.has_bfloat16_products(), reason="this CPU has no AMX")
 
 
-@pytest.fixture(params=kernel.available_bfloat16_products() or [NONE])
-def products(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Each kind of instructions for such products that this CPU has, in use inside the context of them."""
-    before = kernel.bfloat16_products()
-    assert before is not None
-    kernel.use_bfloat16_products(request.param)
+@pytest.fixture
+def products() -> Iterator[None]:
+    """A test inside the context of products in bfloat16."""
     with bfloat16_products():
-        yield request.param
-    kernel.use_bfloat16_products(before)
+        yield
 
 
 def differentiate(function: Callable[..., Tensor], given: Chain, shared: GroupBias, v_output: Tensor) -> list[Tensor]:
@@ -65,7 +61,9 @@ def in_groups_of_integers(rows: int, width: int) -> GroupBias:
 
 @pytest.mark.parametrize("widths", CHAINS)
 @pytest.mark.parametrize("rows", [*ROWS, 5000])
-def test_small_integers_give_the_bits_of_torch(widths: tuple[int, ...], rows: int, products: str) -> None:
+@needs_amx
+@pytest.mark.usefixtures("products")
+def test_small_integers_give_the_bits_of_torch(widths: tuple[int, ...], rows: int) -> None:
     given, shared, v_output = small_integers(widths, rows)
     expected = differentiate(plain_perceptron, given, shared, v_output)
     single = GroupBias(shared.values.float(), shared.groups)
@@ -80,7 +78,9 @@ def rounded(x: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("rows", [7, 1111])
-def test_factors_are_rounded_to_nearest_and_sums_are_not(rows: int, products: str) -> None:
+@needs_amx
+@pytest.mark.usefixtures("products")
+def test_factors_are_rounded_to_nearest_and_sums_are_not(rows: int) -> None:
     given, v_output = chain((51, 40), rows), upstream(rows, 40)
     inputs, (weight,), (bias,) = given.inputs, given.weights, given.biases
     exact = rounded(inputs) @ rounded(weight).T + bias
@@ -98,29 +98,19 @@ def test_factors_are_rounded_to_nearest_and_sums_are_not(rows: int, products: st
 
 
 @pytest.mark.parametrize("threads", [2, 5])
-def test_any_number_of_threads_gives_the_same_bits(threads: int, products: str) -> None:
+@needs_amx
+@pytest.mark.usefixtures("products")
+def test_any_number_of_threads_gives_the_same_bits(threads: int) -> None:
     given, v_output, shared = chain(CHAINS[0], 5000).to(torch.float32), upstream(5000, 10), in_groups(5000, 7, 64)
     shared = GroupBias(shared.values.float(), shared.groups)
     one, many = (differentiate(perceptron, given, shared, v_output) for _ in with_threads((1, threads)))
     assert all(torch.equal(a, b) for a, b in zip(one, many, strict=True))
 
 
-def test_both_instructions_agree_up_to_the_order_of_sums() -> None:
-    kinds = kernel.available_bfloat16_products()
-    if len(kinds) < 2:
-        pytest.skip("this CPU has fewer than two kinds of instructions for products in bfloat16")
-    given = chain((51, 40), 300).to(torch.float32)
-    results = []
-    for kind in kinds:
-        kernel.use_bfloat16_products(kind)
-        with bfloat16_products():
-            results.append(perceptron(given.inputs, given.weights, given.biases))
-    kernel.use_bfloat16_products(kinds[0])
-    torch.testing.assert_close(*results, rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.parametrize("poison", [torch.nan, torch.inf])
-def test_a_row_that_is_not_finite_stays_so_and_touches_no_other(poison: float, products: str) -> None:
+@needs_amx
+@pytest.mark.usefixtures("products")
+def test_a_row_that_is_not_finite_stays_so_and_touches_no_other(poison: float) -> None:
     given = chain(CHAINS[0], 200).to(torch.float32)
     values = perceptron(given.inputs, given.weights, given.biases)
     bad = given.inputs.clone()
@@ -131,7 +121,9 @@ def test_a_row_that_is_not_finite_stays_so_and_touches_no_other(poison: float, p
     assert torch.equal(result[others], values[others])
 
 
-def test_no_rows_give_no_values_and_zero_gradients(products: str) -> None:
+@needs_amx
+@pytest.mark.usefixtures("products")
+def test_no_rows_give_no_values_and_zero_gradients() -> None:
     given = chain((4, 6, 3), 0).to(torch.float32)
     shared = GroupBias(torch.zeros(0, 6), torch.zeros(0, dtype=torch.int64))
     values, *gradients = differentiate(perceptron, given, shared, upstream(0, 3))
@@ -139,7 +131,9 @@ def test_no_rows_give_no_values_and_zero_gradients(products: str) -> None:
     assert all(not gradient.any() for gradient in gradients)
 
 
-def test_double_precision_and_calls_outside_of_the_context_are_not_rounded(products: str) -> None:
+@needs_amx
+@pytest.mark.usefixtures("products")
+def test_double_precision_and_calls_outside_of_the_context_are_not_rounded() -> None:
     given = chain((51, 40), 64)
     double = perceptron(given.inputs, given.weights, given.biases)
     torch.testing.assert_close(double, plain_perceptron(given.inputs, given.weights, given.biases), rtol=1e-12, atol=0)
@@ -150,7 +144,9 @@ def test_double_precision_and_calls_outside_of_the_context_are_not_rounded(produ
     assert (within - double).norm() > 100 * (outside - double).norm()
 
 
-def test_a_gradient_has_the_precision_of_its_values(products: str) -> None:
+@needs_amx
+@pytest.mark.usefixtures("products")
+def test_a_gradient_has_the_precision_of_its_values() -> None:
     """The gradient may be asked for after the context has ended, as optimisers do."""
     given = chain((51, 40, 7), 300).to(torch.float32)
     shared = GroupBias(torch.zeros(1, 40), torch.zeros(300, dtype=torch.int64))
@@ -164,13 +160,8 @@ def test_a_gradient_has_the_precision_of_its_values(products: str) -> None:
 
 def test_another_instruction_set_leaves_them_out(isa: str) -> None:
     given = chain((4, 6, 3), 5).to(torch.float32)
-    if kernel.bfloat16_products() is not None:
+    if kernel.has_bfloat16_products():
         assert isa == "avx512"
         return
-    with bfloat16_products(), pytest.raises(ValueError, match="no instructions for products in bfloat16"):
+    with bfloat16_products(), pytest.raises(ValueError, match="no AMX for products in bfloat16"):
         perceptron(given.inputs, given.weights, given.biases)
-
-
-def test_unknown_instructions_are_refused() -> None:
-    with pytest.raises(ValueError, match="'x' are not available here"):
-        kernel.use_bfloat16_products("x")

@@ -16,9 +16,7 @@ from graings.errors import KernelError
 from graings.training.network_precision import rounds_products
 from graings.training.trainer import Trainer
 
-needs_bfloat16 = pytest.mark.skipif(
-    kernel.bfloat16_products() is None, reason="this CPU has no instructions for products in bfloat16"
-)
+needs_amx = pytest.mark.skipif(not kernel.has_bfloat16_products(), reason="this CPU has no AMX")
 
 
 def trainer(folder: Path, precision: str) -> Trainer:
@@ -29,16 +27,16 @@ def trainer(folder: Path, precision: str) -> Trainer:
 
 
 def test_auto_rounds_where_the_cpu_can_and_float32_never_does(isa: str) -> None:
-    available = kernel.bfloat16_products() is not None
+    available = kernel.has_bfloat16_products()
     assert rounds_products(make_config("standard")) is available
     assert rounds_products(make_config("standard", {"network_precision": "float32"})) is False
     assert rounds_products(make_config("paper")) is False
     if not available:
-        with pytest.raises(KernelError, match="network_precision: this CPU has no instructions"):
+        with pytest.raises(KernelError, match="network_precision: this CPU has no AMX"):
             rounds_products(make_config("standard", {"network_precision": "bfloat16"}))
 
 
-@needs_bfloat16
+@needs_amx
 def test_training_rounds_products_and_drawing_does_not(tmp_path: Path) -> None:
     capture = write_synthetic(tmp_path, frames=6, size=48)
     one, other = trainer(capture, "bfloat16"), trainer(capture, "float32")

@@ -1,5 +1,5 @@
 // The loops of layers.hpp with weights and activations rounded to bfloat16 for every product; sums, biases and outputs are
-// float32. Compiled for AMX and for AVX512-BF16 (CMakeLists.txt).
+// float32. Compiled for the tile registers of AMX (CMakeLists.txt).
 #include "registers.hpp"
 #include "types.hpp"
 
@@ -10,7 +10,6 @@ namespace {
 using Args = NetworkArgs<float, Bfloat16>;
 constexpr int64_t kRows = kNetworkRows, kStrip = 2 * kTileColumns;
 
-#ifdef __AMX_BF16__
 // While it lives, this thread's eight tile registers have 16 rows of 64 bytes.
 class Registers {
 public:
@@ -56,33 +55,6 @@ GRAINGS_INLINE void block(int64_t depth, const Bfloat16* a, int64_t a_row, const
     _tile_stored(2, c + 16 * c_row, c_bytes);
     _tile_stored(3, c + 16 * c_row + 16, c_bytes);
 }
-#else
-struct Registers {
-    Registers() {}
-};
-
-GRAINGS_INLINE void block(int64_t depth, const Bfloat16* a, int64_t a_row, const Bfloat16* b, int64_t b_column, float* c, int64_t c_row, bool add) {
-    constexpr int kTall = 8;  // 8 x 2 sums hide the latency of the multipliers
-    for (int64_t begin = 0; begin < 2 * kTileColumns; begin += kTall) {
-        __m512 sums[kTall][2];
-        for (int m = 0; m < kTall; m++)
-            for (int v = 0; v < 2; v++) sums[m][v] = add ? _mm512_loadu_ps(c + (begin + m) * c_row + 16 * v) : _mm512_setzero_ps();
-        for (int64_t k = 0; k < depth; k += 2) {
-            const Bfloat16* pairs = b + k * kTileColumns;
-            const auto left = (__m512bh)_mm512_loadu_si512(pairs), right = (__m512bh)_mm512_loadu_si512(pairs + b_column);
-            for (int m = 0; m < kTall; m++) {
-                int32_t pair;
-                __builtin_memcpy(&pair, a + (begin + m) * a_row + k, sizeof pair);
-                const auto factor = (__m512bh)_mm512_set1_epi32(pair);
-                sums[m][0] = _mm512_dpbf16_ps(sums[m][0], factor, left);
-                sums[m][1] = _mm512_dpbf16_ps(sums[m][1], factor, right);
-            }
-        }
-        for (int m = 0; m < kTall; m++)
-            for (int v = 0; v < 2; v++) _mm512_storeu_ps(c + (begin + m) * c_row + 16 * v, sums[m][v]);
-    }
-}
-#endif
 
 // c += a b for c [rows, columns]; all sizes are multiples of 32. Rows of `a` are a_row apart, `b` is in tiles.
 GRAINGS_INLINE void add_product(int64_t rows, int64_t columns, int64_t depth, const Bfloat16* a, int64_t a_row, const Bfloat16* b, float* c) {

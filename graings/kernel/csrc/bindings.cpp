@@ -223,9 +223,7 @@ NB_MODULE(_kernel, m) {
     m.def("hidden_size", [](const std::vector<int64_t>& widths, int64_t rows, bool bfloat16) {
         return graings::hidden_size(widths, rows, bfloat16 ? graings::kInBfloat16 : graings::kAsStored);
     }, "widths"_a, "rows"_a, "bfloat16"_a, "Elements that a network's hidden activations take.");
-    m.def("bfloat16_products", &graings::bfloat16_products, "Instructions for products in bfloat16: amx, avx512bf16, or an empty string.");
-    m.def("available_bfloat16_products", &graings::available_bfloat16_products, "Instructions for products in bfloat16 that this CPU has, best first.");
-    m.def("use_bfloat16_products", &graings::use_bfloat16_products, "name"_a, "Uses these instructions for products in bfloat16 for the whole process.");
+    m.def("has_bfloat16_products", &graings::has_bfloat16_products, "Whether networks can have products in bfloat16 here.");
     m.def("ssim_constants", [] {
         nb::dict constants;
         constants["taps"] = std::vector<double>(std::begin(graings::kSsimTaps), std::end(graings::kSsimTaps));

@@ -11,10 +11,8 @@ std::string active_isa();                    // throws std::invalid_argument whe
 void use_isa(const std::string& name);       // for the whole process
 template <class R> const Kernels<R>& kernels();
 
-// The instructions for products in bfloat16: "amx", "avx512bf16", or "" where there are none or avx512 is not in use.
-std::string bfloat16_products();
-std::vector<std::string> available_bfloat16_products();  // best first
-void use_bfloat16_products(const std::string& name);     // for the whole process
+// Products in bfloat16: where the CPU and its system have AMX, and avx512 is in use.
+bool has_bfloat16_products();
 const Bfloat16Kernels& bfloat16_kernels();  // throws std::invalid_argument where there are none
 
 }  // namespace graings

@@ -18,7 +18,7 @@ struct Network {
 };
 
 // Whether products are of the numbers as they are, or of numbers rounded to bfloat16; the latter for float32 and where
-// bfloat16_products() (isa.hpp) names instructions for it.
+// has_bfloat16_products() (isa.hpp).
 enum Products { kAsStored, kInBfloat16 };
 
 // Number of elements of the hidden activations of so many rows.

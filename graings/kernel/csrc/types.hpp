@@ -238,7 +238,7 @@ struct Kernels {
     void (*blend_children)(const BlendArgs<R>&, int64_t begin, int64_t end);  // blocks
 };
 
-// Networks whose weights and activations are rounded to bfloat16 for every product, compiled for CPUs with such instructions.
+// Networks whose weights and activations are rounded to bfloat16 for every product, compiled for AMX.
 struct Bfloat16Kernels {
     void (*network_values)(const NetworkArgs<float, Bfloat16>&, int64_t begin, int64_t end, float* scratch);
     void (*network_gradient)(const NetworkArgs<float, Bfloat16>&, int64_t begin, int64_t end, float* sums, float* scratch);
