@@ -96,17 +96,17 @@ void networks() {
         to_weights.push_back(v_weights[l].data()), to_biases.push_back(v_biases[l].data());
     }
     const auto places = from.many<R>(3 * rows, -1, 1);
-    std::vector<R> input(size_t(39 * rows)), output(size_t(10 * rows)), hidden(size_t(graings::hidden_size(widths, rows))), v_input(input.size());
+    std::vector<R> input(size_t(39 * rows)), output(size_t(10 * rows)), hidden(size_t(graings::hidden_size(widths, rows, graings::kAsStored))), v_input(input.size());
     graings::encode<R>(rows, 3, 6, places.data(), input.data(), 2);
     std::vector<R> harmonics(size_t(30 * rows)), v_normals(places.size());
     const auto normals = from.many<R>(3 * rows, -2, 2), v_harmonics = from.many<R>(30 * rows, -1, 1);
     graings::encode_directions<R>(rows, 3, places.data(), normals.data(), harmonics.data(), 2);
     graings::encode_directions_gradient<R>(rows, 3, places.data(), normals.data(), v_harmonics.data(), v_normals.data(), 2);
     write("harmonics", harmonics), write("v_normals", v_normals);
-    graings::evaluate<R>(network, rows, input.data(), output.data(), hidden.data(), 2);
+    graings::evaluate<R>(network, rows, input.data(), output.data(), hidden.data(), graings::kAsStored, 2);
     write("encoded", input), write("network", output);
     const auto upstream = from.many<R>(10 * rows, -1, 1);
-    graings::differentiate<R>(network, rows, input.data(), hidden.data(), upstream.data(), v_input.data(), to_weights, to_biases, nullptr, 2);
+    graings::differentiate<R>(network, rows, input.data(), hidden.data(), upstream.data(), v_input.data(), to_weights, to_biases, nullptr, graings::kAsStored, 2);
     write("v_input", v_input);
     for (size_t l = 0; l < weights.size(); l++) write(("v_weight" + std::to_string(l)).c_str(), v_weights[l]), write(("v_bias" + std::to_string(l)).c_str(), v_biases[l]);
 }

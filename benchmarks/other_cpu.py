@@ -40,6 +40,8 @@ FLAGS = [
     "-static",
 ]
 LIMIT = 1e-12  # of float64
+# Compiled once for each instruction set, for Python, and for AMX.
+ELSEWHERE = ("kernels.cpp", "bindings.cpp", "prepared_bindings.cpp", "bfloat16.cpp")
 Arrays = dict[str, NDArray[np.float64]]
 
 
@@ -57,13 +59,15 @@ def build(compiler: str, folder: Path) -> Path:
         objects.append(folder / f"{name}.o")
         compile_one = [compiler, *FLAGS, *flags, f"-DGRAINGS_ISA={name}", "-c", str(SOURCES / "kernels.cpp")]
         subprocess.run([*compile_one, "-o", str(objects[-1])], check=True)
-    others = [str(path) for path in sorted(SOURCES.glob("*.cpp")) if path.name not in ("kernels.cpp", "bindings.cpp")]
     program = folder / "program"
-    main = str(Path(__file__).with_suffix(".cpp"))
-    subprocess.run(
-        [compiler, *FLAGS, *define, f"-I{SOURCES}", main, *others, *map(str, objects), "-o", str(program)], check=True
-    )
+    subprocess.run([compiler, *FLAGS, *define, *sources(), *map(str, objects), "-o", str(program)], check=True)
     return program
+
+
+def sources() -> list[str]:
+    """What is compiled once for all instruction sets, and where its headers are."""
+    kernels = [str(path) for path in sorted(SOURCES.glob("*.cpp")) if path.name not in ELSEWHERE]
+    return [f"-I{SOURCES}", str(Path(__file__).with_suffix(".cpp")), *kernels]
 
 
 def output(*command: str, isa: str) -> Arrays:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -73,6 +74,12 @@ def test_an_addition_that_the_preset_lacks_has_no_row(scripts: Any, tmp_path: Pa
         lines = list(single.table(tmp_path, [tmp_path / "scene"], preset, [0]))
         assert any("residual_view" in line for line in lines) == has
         assert any("reflection" in line for line in lines)
+
+
+def test_the_program_for_other_cpus_compiles_without_python(scripts: Any) -> None:
+    program = scripts("other_cpu")
+    command = ["g++", *program.FLAGS, "-fsyntax-only", *program.sources()]
+    assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == ""
 
 
 def test_a_capture_that_cannot_be_trained_is_named_in_one_line(scripts: Any, tmp_path: Path) -> None:
