@@ -190,7 +190,7 @@ void network_gradient(const Args& args, int64_t begin, int64_t end, float* sums,
     const Registers registers;
     Scratch scratch(args, memory);
     Bfloat16 *above = scratch.above, *below = scratch.below;
-    const int64_t before = begin ? args.groups ? args.groups[begin - 1] : -1 : -1;
+    const int64_t before = begin && args.groups ? args.groups[begin - 1] : -1;
     for (int64_t row = begin; row < end; row += kRows) {
         const int64_t rows = end - row < kRows ? end - row : kRows;
         scratch.place(args, row);

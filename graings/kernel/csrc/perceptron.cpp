@@ -13,7 +13,7 @@ namespace {
 
 // Rows per piece of work and per set of partial sums: fixed, so that sums do not depend on the number of threads.
 template <class R, class Stored>
-constexpr int64_t kPieceRows = (Packing<R, Stored>::kRounded ? 32 : 8) * kNetworkRows;
+constexpr int64_t kPieceRows = (Packing<R, Stored>::kRounded ? 16 : 8) * kNetworkRows;
 
 template <class R, class Stored>
 const auto& loops() {
