@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, NamedTuple
 
 import torch
@@ -18,21 +19,21 @@ from torch.nn import functional
 
 from graings import kernel
 
-_bfloat16 = False
+# Of each thread: one may train while another renders.
+_bfloat16 = ContextVar("bfloat16", default=False)
 
 
 @contextmanager
 def bfloat16_products(enabled: bool = True) -> Iterator[None]:
-    """Inside the context `perceptron` rounds the factors of its products to bfloat16, in both passes.
+    """Inside the context `perceptron` rounds the factors of its products to bfloat16, in both passes, in this thread.
 
     Sums, biases and outputs stay float32. Without `kernel.has_bfloat16_products()`, `perceptron` raises `ValueError`.
     """
-    global _bfloat16
-    before, _bfloat16 = _bfloat16, enabled
+    token = _bfloat16.set(enabled)
     try:
         yield
     finally:
-        _bfloat16 = before
+        _bfloat16.reset(token)
 
 
 class GroupBias(NamedTuple):
@@ -78,7 +79,7 @@ def perceptron(
         tensors.append(shared.values)
     if any(t.dtype != dtype or t.device.type != "cpu" for t in tensors):
         raise ValueError(f"inputs, weights, biases and shared values must all be {dtype} on the CPU")
-    bfloat16 = _bfloat16 and dtype == torch.float32
+    bfloat16 = _bfloat16.get() and dtype == torch.float32
     values: Tensor = _Perceptron.apply(kernel.thread_count(), bfloat16, groups, *tensors)  # type: ignore[no-untyped-call]
     return values
 

@@ -16,7 +16,7 @@ from graings.capture.images import ImageStore
 from graings.capture.load import load_capture
 from graings.capture.synthetic import write_synthetic
 from graings.config import RatesConfig, TrainConfig, make_config
-from graings.kernel import computing_threads
+from graings.kernel import computing_threads, has_bfloat16_products
 from graings.plan.cost import (
     CALIBRATION_FILE,
     TERMS,
@@ -85,8 +85,10 @@ def measure_calibration(threads: int) -> Calibration:
             rows.append(load.terms())
             cpu.append(cpu_s)
             wall.append(wall_s)
-        size, anchors, views, deformation, residual = CASES[BUSIEST]
-        _, float32_s, _ = _timed(captures[size], _config(anchors, views, deformation, residual, "float32"))
+        float32_s = None
+        if has_bfloat16_products():
+            size, anchors, views, deformation, residual = CASES[BUSIEST]
+            _, float32_s, _ = _timed(captures[size], _config(anchors, views, deformation, residual, "float32"))
     seconds = np.array(cpu)
     times = _non_negative(np.array(rows), seconds)
     relative = np.array(rows) @ times / seconds - 1.0
@@ -95,7 +97,7 @@ def measure_calibration(threads: int) -> Calibration:
         cpu=machine_facts().cpu,
         threads=threads,
         **dict(zip(TERMS, times.tolist(), strict=True)),
-        float32=_slower(rows[BUSIEST], cpu[BUSIEST], times, float32_s),
+        float32=1.0 if float32_s is None else _slower(rows[BUSIEST], cpu[BUSIEST], times, float32_s),
         # Other processes only lengthen the wall-clock time; one thread alone takes as long as its CPU time.
         wall_over_cpu=min(1.0, float(np.min(np.array(wall) / seconds))),
         error=float(np.sqrt(np.mean(np.square(relative)))),
@@ -104,7 +106,7 @@ def measure_calibration(threads: int) -> Calibration:
 
 
 def _slower(load: tuple[float, ...], seconds: float, times: NDArray[np.float64], float32_s: float) -> float:
-    """Time of the Gaussians of a load in float32 over that in `seconds`; at least 1, where both are the same."""
+    """Time of the Gaussians of a load in float32 over that in `seconds`, the CPU seconds in bfloat16; at least 1."""
     gaussians = TERMS.index("gaussian")
     others = float(np.dot(load[:gaussians], times[:gaussians]))
     return max(1.0, (float32_s - others) / max(seconds - others, 1e-9))

@@ -87,6 +87,7 @@ class TrainerState:
         tracks: MotionTracks | None = None,
     ) -> State:
         """A trainer of a new scene. Raises `CaptureError` where no image shows anything."""
+        rounds_products(config)  # refused before the first anchors are made, which takes longer
         streams = RandomStreams(config.seed)
         initial = make_scene(capture, images, config, streams, tracks)
         return cls(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -156,6 +157,19 @@ def test_a_gradient_has_the_precision_of_its_values() -> None:
     with bfloat16_products(False):
         gradients = torch.autograd.grad(values, leaves, upstream(300, 7).float())
     assert all(torch.equal(a, b) for a, b in zip(gradients, within[1:-1], strict=True))
+
+
+@needs_amx
+@pytest.mark.usefixtures("products")
+def test_another_thread_is_not_rounded_by_the_context_of_this_one() -> None:
+    """One thread may train while another renders, and contexts of two threads may end in any order."""
+    given = chain((51, 40), 64).to(torch.float32)
+    rounded_values = perceptron(given.inputs, given.weights, given.biases)
+    with ThreadPoolExecutor(1) as other:
+        values = other.submit(perceptron, given.inputs, given.weights, given.biases).result()
+    with bfloat16_products(False):
+        assert torch.equal(values, perceptron(given.inputs, given.weights, given.biases))
+    assert not torch.equal(values, rounded_values)
 
 
 def test_another_instruction_set_leaves_them_out(isa: str) -> None:
