@@ -32,8 +32,12 @@ class Codec:
 
 # Quality is nearly constant (CRF); the tags say that colours are those of sRGB screens.
 _TAGS: Final = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "iec61966-2-1", "color_range": "tv"}
+# Without it libx264 spreads its bits over blocks by AVX-512 code that gives other results on each run.
+_REPRODUCIBLE: Final = {"x264-params": "cpu-independent=1"}
 CODECS: Final = {
-    ".mp4": Codec("libx264", "yuv420p", {"crf": "16", "preset": "medium", **_TAGS}, {"movflags": "+faststart"}),
+    ".mp4": Codec(
+        "libx264", "yuv420p", {"crf": "16", "preset": "medium", **_TAGS, **_REPRODUCIBLE}, {"movflags": "+faststart"}
+    ),
     ".webm": Codec("libvpx-vp9", "yuv420p", {"crf": "22", "b:v": "0", "row-mt": "1", "cpu-used": "4", **_TAGS}, {}),
     # Not libwebp_anim, which leaves faint traces of earlier frames where the background is seen again.
     ".webp": Codec("libwebp", "bgra", {"quality": "85"}, {"loop": "0"}),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from graings.errors import CheckpointError
 from graings.export import video_parts
 from graings.export.camera_path import frames_of
 from graings.export.video import FORMATS, check_video, video_size, write_video
-from graings.export.video_file import decoded, video_file
+from graings.export.video_file import CODECS, decoded, video_file
 from graings.export.video_parts import open_parts
 from graings.render import render
 from tests.export.models import tiny_shown
@@ -134,6 +135,19 @@ def test_an_interrupted_video_goes_on_after_its_last_part_and_is_the_same(suffix
     for found, expected in zip(pictures(path), pictures(whole), strict=True):
         np.testing.assert_array_equal(found, expected)
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted([path.name, whole.name])
+
+
+def test_an_mp4_has_the_same_bits_with_and_without_the_vector_code_of_its_encoder(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    frames = path_of(10)
+    write_video(tmp_path / "vector.mp4", tiny_shown(), frames, WHITE)
+    codec = CODECS[".mp4"]
+    plain = {**codec.options, "x264-params": f"{codec.options.get('x264-params', '')}:asm=0".strip(":")}
+    monkeypatch.setitem(CODECS, ".mp4", replace(codec, options=plain))
+    write_video(tmp_path / "plain.mp4", tiny_shown(), frames, WHITE)
+    for found, expected in zip(pictures(tmp_path / "vector.mp4"), pictures(tmp_path / "plain.mp4"), strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("suffix", KINDS)
