@@ -32,7 +32,7 @@ class Codec:
 
 # Quality is nearly constant (CRF); the tags say that colours are those of sRGB screens.
 _TAGS: Final = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "iec61966-2-1", "color_range": "tv"}
-# Without it libx264 spreads its bits over blocks by AVX-512 code that gives other results on each run.
+# Without it the macroblock tree of libx264 uses AVX-512 code whose results vary from run to run.
 _REPRODUCIBLE: Final = {"x264-params": "cpu-independent=1"}
 CODECS: Final = {
     ".mp4": Codec(
