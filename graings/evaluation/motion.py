@@ -56,9 +56,10 @@ def measure_motion(scene: Scene, eye: ArrayLike, times: Sequence[float], positio
         offsets = []
         for time in times:
             deformation = scene.deform(children, canonical, time)
-            offsets.append(np.zeros_like(means) if deformation is None else deformation.position.double().numpy())
-    moved = np.stack(offsets) - offsets[0]
-    return motion_error(follow(truth[0], means, opacities[solid], moved), truth)
+            moved = None if deformation is None else deformation.position_offsets(0).double().numpy()
+            offsets.append(np.zeros_like(means) if moved is None else moved)
+    displacements = np.stack(offsets) - offsets[0]
+    return motion_error(follow(truth[0], means, opacities[solid], displacements), truth)
 
 
 def follow(points: Array, means: Array, opacities: Array, displacements: Array) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -63,15 +63,24 @@ def plain_gather(scaffold: Scaffold, children: Int64[Tensor, " gaussian"]) -> Ch
 Geometry = tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"], Float[Tensor, "gaussian 3"]]
 
 
+class Posed(NamedTuple):
+    """N children at one time."""
+
+    means: Float[Tensor, "gaussian 3"]
+    quats: Float[Tensor, "gaussian 4"]
+    log_scales: Float[Tensor, "gaussian 3"]
+    position_offsets: Float[Tensor, "gaussian 3"] | None  # Delta x of Eq. 10, normalised units; None: static
+
+
 def compose(
     canonical: Float[Tensor, "gaussian 7"],
     children: Children,
-    deformation: Float[Tensor, "gaussian 10"] | None,
+    deformation: Float[Tensor, "gaussian time 10"] | None,
     extent: float,
     *,
     projected_clip: bool,
-) -> Geometry:
-    """Means, quaternions and log-scales of the rendered children, Eq. 10.
+) -> list[Posed]:
+    """The rendered children at each time, Eq. 10; at one time without a `deformation`.
 
     `canonical` is the output of StaticMLP: quaternion minus the identity, log-scale minus the anchor's. `deformation`
     is that of DeformNet: offsets of position in units of `extent`, of rotation (minus the identity) and of log-scale;
@@ -79,29 +88,41 @@ def compose(
     rasterizer normalises it.
     """
     inputs = (canonical, children.anchor_log_scales, children.canonical_means, deformation)
-    geometry: Geometry = _Compose.apply(*inputs, extent, projected_clip, kernel.thread_count())  # type: ignore[no-untyped-call]
-    return geometry
+    outputs: tuple[Tensor, ...] = _Compose.apply(*inputs, extent, projected_clip, kernel.thread_count())  # type: ignore[no-untyped-call]
+    if deformation is None:
+        means, quats, log_scales = outputs
+        return [Posed(means, quats, log_scales, None)]
+    return [Posed(*outputs[first : first + 4]) for first in range(0, len(outputs), 4)]
 
 
 def plain_compose(
     canonical: Float[Tensor, "gaussian 7"],
     children: Children,
-    deformation: Float[Tensor, "gaussian 10"] | None,
+    deformation: Float[Tensor, "gaussian time 10"] | None,
     extent: float,
     *,
     projected_clip: bool,
-) -> Geometry:
+) -> list[Posed]:
     """The oracle of `compose`."""
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=canonical.dtype)
     quats = functional.normalize(canonical[:, :4] + identity, dim=-1, eps=1e-12)
     log_scales = children.anchor_log_scales + canonical[:, 4:]
-    means = children.canonical_means
-    if deformation is not None:
-        means = means + deformation[:, :3] * extent
-        quats = quaternion_product(quats, deformation[:, 3:7] + identity)
-        offsets = clip(deformation[:, 7:], -MAX_LOG_SCALE_OFFSET, MAX_LOG_SCALE_OFFSET, projected=projected_clip)
-        log_scales = log_scales + offsets
-    return means, quats, clip(log_scales, *LOG_SCALE_RANGE, projected=projected_clip)
+    if deformation is None:
+        log_scales = clip(log_scales, *LOG_SCALE_RANGE, projected=projected_clip)
+        return [Posed(children.canonical_means, quats, log_scales, None)]
+    result = []
+    for offsets in deformation.unbind(1):
+        position_offsets = offsets[:, :3] * extent
+        change = clip(offsets[:, 7:], -MAX_LOG_SCALE_OFFSET, MAX_LOG_SCALE_OFFSET, projected=projected_clip)
+        result.append(
+            Posed(
+                children.canonical_means + position_offsets,
+                quaternion_product(quats, offsets[:, 3:7] + identity),
+                clip(log_scales + change, *LOG_SCALE_RANGE, projected=projected_clip),
+                position_offsets,
+            )
+        )
+    return result
 
 
 def quaternion_product(a: Float[Tensor, "gaussian 4"], b: Float[Tensor, "gaussian 4"]) -> Float[Tensor, "gaussian 4"]:
@@ -147,6 +168,8 @@ class _Gather(torch.autograd.Function):
 
 
 class _Compose(torch.autograd.Function):
+    """Outputs are those of `Posed`, time after time."""
+
     @staticmethod
     def forward(
         ctx: Any,
@@ -157,24 +180,32 @@ class _Compose(torch.autograd.Function):
         extent: float,
         projected: bool,
         threads: int,
-    ) -> Geometry:
+    ) -> tuple[Tensor, ...]:
         inputs = (canonical, anchor_log_scales, canonical_means, deformation)
         tensors = [None if t is None else t.detach().contiguous() for t in inputs]
-        means, quats = torch.empty_like(canonical_means), canonical_means.new_empty(len(canonical_means), 4)
-        log_scales = torch.empty_like(canonical_means)
+        times = 1 if deformation is None else deformation.shape[1]
+        widths = (3, 4, 3) if deformation is None else (3, 4, 3, 3)
+        outputs = [canonical.new_empty(times, len(canonical), width) for width in widths]
         ctx.constants = (extent, MAX_LOG_SCALE_OFFSET, *LOG_SCALE_RANGE, projected)
-        kernel.call("compose", *tensors, *ctx.constants, means, quats, log_scales, threads)
+        kernel.call("compose", *tensors, *ctx.constants, *outputs, *[None] * (4 - len(outputs)), threads)
         ctx.save_for_backward(*tensors)
+        ctx.set_materialize_grads(False)
         ctx.threads = threads
-        return means, quats, log_scales
+        return tuple(output[time] for time in range(times) for output in outputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_means: Tensor, v_quats: Tensor, v_log_scales: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         canonical, anchor_log_scales, canonical_means, deformation = ctx.saved_tensors
-        v_canonical = torch.empty_like(canonical)
+        gradients = [None if v is None else v.contiguous() for v in upstream]
+        if deformation is None:
+            of_outputs = [[gradient] for gradient in (*gradients, None)]
+        else:
+            of_outputs = [gradients[output::4] for output in range(4)]
+        v_canonical, v_log_scales = torch.empty_like(canonical), torch.empty_like(anchor_log_scales)
+        v_means = torch.empty_like(canonical_means)
         v_deformation = None if deformation is None else torch.empty_like(deformation)
         inputs = (canonical, anchor_log_scales, canonical_means, deformation)
-        upstream = [v.contiguous() for v in (v_means, v_quats, v_log_scales)]
-        kernel.call("compose_gradient", *inputs, *ctx.constants, *upstream, v_canonical, v_deformation, ctx.threads)
-        return v_canonical, v_canonical[:, 4:], v_means, v_deformation, None, None, None
+        results = (v_canonical, v_log_scales, v_means, v_deformation)
+        kernel.call("compose_gradient", *inputs, *ctx.constants, *of_outputs, *results, ctx.threads)
+        return (*results, None, None, None)

@@ -19,26 +19,28 @@ from graings.scene.perceptron import GroupBias, perceptron, weights_and_biases
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deformation:
-    """Offsets of N Gaussians at one time (Eq. 7): position (3, normalised units), rotation (4) and log-scale (3).
+    """Offsets of N Gaussians at times that were evaluated together (Eq. 7): position, rotation and log-scale.
 
-    The rotation is delta with Delta r = (1, 0, 0, 0) + delta up to its length, so that zero is no rotation. Log-scales
-    are those before the clip of Eq. 10.
+    Positions are in units of `extent` (the scene's half-size), in which learning rates do not depend on the size of the
+    scene. The rotation is delta with Delta r = (1, 0, 0, 0) + delta up to its length, so that zero is no rotation.
+    Log-scales are those before the clip of Eq. 10.
     """
 
-    offsets: Float[Tensor, "gaussian 10"]
+    outputs: Float[Tensor, "gaussian time 10"]
+    extent: float
 
     @property
-    def position(self) -> Float[Tensor, "gaussian 3"]:
-        """Delta x, which is added to the canonical position."""
-        return self.offsets[:, :3]
+    def units(self) -> Float[Tensor, " 10"]:
+        """What each of the ten offsets is a multiple of."""
+        return torch.tensor([self.extent] * 3 + [1.0] * 7, dtype=self.outputs.dtype)
 
+    def position_offsets(self, index: int) -> Float[Tensor, "gaussian 3"]:
+        """Delta x at time `index`, normalised units."""
+        return self.outputs[:, index, :3] * self.extent
 
-def deformation_from(raw: Float[Tensor, "gaussian 10"], extent: float) -> Deformation:
-    """Offsets from the output of DeformNet, whose positions are in units of `extent` (the scene's half-size).
-
-    In these units learning rates do not depend on the size of the scene.
-    """
-    return Deformation(raw * torch.tensor([extent] * 3 + [1.0] * 7, dtype=raw.dtype))
+    def offsets(self, index: int) -> Float[Tensor, "gaussian 10"]:
+        """Offsets at time `index`, positions in normalised units."""
+        return self.outputs[:, index] * self.units
 
 
 class DeformationNetwork(nn.Module):
@@ -64,7 +66,7 @@ class DeformationNetwork(nn.Module):
 
     def forward(
         self, positions: Float[Tensor, "gaussian 3"], times: Float[Tensor, "time 1"]
-    ) -> Float[Tensor, "time gaussian 10"]:
+    ) -> Float[Tensor, "gaussian time 10"]:
         """Offsets for `positions` in units of the scene's extent at `times` in [0, 1].
 
         With factorized time the hidden layers run once for all times: each further time adds ten outputs.
@@ -73,14 +75,15 @@ class DeformationNetwork(nn.Module):
         weights, biases = self._layers()
         if self.psi is not None:
             weights[-1], biases[-1] = self.output_layer(times)
-            return perceptron(encoded_positions, weights, biases).unflatten(1, (len(times), -1)).transpose(0, 1)
+            return perceptron(encoded_positions, weights, biases).unflatten(1, (len(times), -1))
         assert self.from_time is not None
         first, *others = biases
         return torch.stack(
             [
                 perceptron(encoded_positions, weights, [first + from_time, *others])
                 for from_time in self.from_time(frequency_encoding(times, self.time_frequencies))
-            ]
+            ],
+            dim=1,
         )
 
     def hidden_units(self, positions: Float[Tensor, "gaussian 3"]) -> Float[Tensor, "gaussian width"]:

@@ -88,9 +88,8 @@ class _Evaluated(PreparedGeometry):
 
 
 def _evaluated(scene: Scene, slots: Tensor, time: float) -> Geometry:
-    children = scene.gathered(slots)
-    ((canonical, raw),) = scene.predicted_geometry(children, slots, [time])
-    return compose(canonical, children, raw, float(scene.extent), projected_clip=scene.config.projected_clip)
+    (posed,), _ = scene.posed(scene.gathered(slots), slots, [time])
+    return posed.means, posed.quats, posed.log_scales
 
 
 class _Factorized(PreparedGeometry):
@@ -145,8 +144,8 @@ class BasisGeometry(PreparedGeometry):
 
 def unmoved(canonical: Float[Tensor, "child 7"], children: Children) -> Float[Tensor, "child 10"]:
     """Mean, unit quaternion and log-scale, not yet clipped, of children without an offset in time."""
-    means, quats, _ = compose(canonical, children, None, 1.0, projected_clip=False)
-    return torch.cat([means, quats, children.anchor_log_scales + canonical[:, 4:]], dim=1)
+    (posed,) = compose(canonical, children, None, 1.0, projected_clip=False)
+    return torch.cat([posed.means, posed.quats, children.anchor_log_scales + canonical[:, 4:]], dim=1)
 
 
 def move(

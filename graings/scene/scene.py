@@ -24,9 +24,9 @@ from graings.random import torch_stream
 from graings.scene.activations import tanh
 from graings.scene.appearance import CanonicalAppearance, ResidualField
 from graings.scene.canonical import INITIAL_SCALE, StaticMLP, default_geometry
-from graings.scene.children import Children, compose, gather
+from graings.scene.children import Children, Posed, compose, gather
 from graings.scene.clip import clip
-from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP, deformation_from
+from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP
 from graings.scene.encoding import directions_from
 from graings.scene.scaffold import Scaffold
 
@@ -49,7 +49,8 @@ class Composition(Composed):
     """
 
     canonical_means: Float[Tensor, "gaussian 3"]  # x_can
-    deformation: Deformation | None
+    position_offsets: Float[Tensor, "gaussian 3"] | None  # Delta x of Eq. 10, normalised units; None: static
+    deformation: Deformation | None  # at the times of all views composed together, in their order
     residual: Float[Tensor, "gaussian 4"] | None  # (Delta c, Delta o) of each Gaussian
     opacities: Float[Tensor, "anchor child"]  # score of every slot, no gradient: o(t) of candidates, else o_can
 
@@ -153,21 +154,19 @@ class Scene(nn.Module):
         color_part = self.appearance.color_part(features)
         children = self.gathered(slot_indices)
         uids = scaffold.child_uids(slot_indices)
-        extent = float(self.extent)
         compositions = []
-        geometries = self.predicted_geometry(children, slot_indices, times)
-        per_view = zip(canonical_opacities, opacities, residuals, directions, geometries, strict=True)
-        for canonical_opacity, opacity, residual, direction, (canonical, raw) in per_view:
+        posed, deformation = self.posed(children, slot_indices, times)
+        per_view = zip(canonical_opacities, opacities, residuals, directions, posed, strict=True)
+        for canonical_opacity, opacity, residual, direction, geometry in per_view:
             colors = self.appearance.colors(color_part, direction, rendered)
             rendered_residual = None
             if residual_field is not None and residual is not None:
                 rendered_residual = residual_field.bounded(residual.flatten(0, 1).index_select(0, rendered))
                 colors = clip(colors + rendered_residual[:, :3], 0.0, 1.0, projected=config.projected_clip)
-            means, quats, log_scales = compose(canonical, children, raw, extent, projected_clip=config.projected_clip)
             gaussians = Gaussians(
-                means=means,
-                quats=quats,
-                log_scales=log_scales,
+                means=geometry.means,
+                quats=geometry.quats,
+                log_scales=geometry.log_scales,
                 opacities=opacity.flatten().index_select(0, rendered),
                 colors=colors,
                 uids=uids,
@@ -177,7 +176,8 @@ class Scene(nn.Module):
                     gaussians=gaussians,
                     children=slot_indices,
                     canonical_means=children.canonical_means,
-                    deformation=None if raw is None else deformation_from(raw, extent),
+                    position_offsets=geometry.position_offsets,
+                    deformation=deformation,
                     residual=rendered_residual,
                     opacities=canonical_opacity.detach().index_copy(0, candidates, opacity.detach()),
                     blur=config.blur,
@@ -211,45 +211,57 @@ class Scene(nn.Module):
     def deform(
         self, children: Int64[Tensor, " gaussian"], canonical_means: Float[Tensor, "gaussian 3"], time: float
     ) -> Deformation | None:
-        """Offsets at `time` of rendered children (flat slots, ascending) at the given canonical positions, Eq. 7.
+        """Offsets of rendered children (flat slots, ascending) with the given canonical positions at one time, Eq. 7.
 
         None while the scene is static. The stop-gradient of Eq. 7 is applied as configured.
         """
         if not self.temporal or (self.deformation is None and self.single is None):
             return None
         if self.single is not None:
-            raw = self._single_mlp(self.single, self.gathered(children), canonical_means, time)[:, 7:]
+            outputs = self._single_mlp(self.single, self.gathered(children), canonical_means, time)[:, None, 7:]
         else:
-            raw = self._predicted_deformation(children, canonical_means, [time])[0]
-        return deformation_from(raw, float(self.extent))
+            outputs = self._predicted_deformation(children, canonical_means, [time])
+        return Deformation(outputs, float(self.extent))
 
-    def predicted_geometry(
+    def posed(
         self, children: Children, slot_indices: Tensor, times: Sequence[float]
-    ) -> list[tuple[Tensor, Tensor | None]]:
-        """Outputs of the geometry networks at each time: canonical geometry, and the deformation or None (static)."""
-        means = children.canonical_means
+    ) -> tuple[list[Posed], Deformation | None]:
+        """The rendered children at each time, and their offsets; None while the scene is static."""
+        means, extent = children.canonical_means, float(self.extent)
+        moves = self.temporal and (self.deformation is not None or self.single is not None)
+        if self.single is not None and moves:
+            # Its canonical geometry may depend on time.
+            at_times = [self._single_mlp(self.single, children, means, time) for time in times]
+            result = [self._composed(one[:, :7], children, one[:, None, 7:])[0] for one in at_times]
+            return result, Deformation(torch.stack([one[:, 7:] for one in at_times], dim=1), extent)
         if self.single is not None:
-            if not self.temporal:
-                return [(self._single_mlp(self.single, children, means, None)[:, :7], None)] * len(times)
-            outputs = [self._single_mlp(self.single, children, means, time) for time in times]
-            return [(output[:, :7], output[:, 7:]) for output in outputs]
-        canonical = default_geometry(means) if self.static is None else self.static(self.scaffold.features, children)
-        if not self.temporal or self.deformation is None:
-            return [(canonical, None)] * len(times)
-        return [(canonical, raw) for raw in self._predicted_deformation(slot_indices, means, times)]
+            canonical = self._single_mlp(self.single, children, means, None)[:, :7]
+        elif self.static is not None:
+            canonical = self.static(self.scaffold.features, children)
+        else:
+            canonical = default_geometry(means)
+        if not moves:
+            return self._composed(canonical, children, None) * len(times), None
+        outputs = self._predicted_deformation(slot_indices, means, times)
+        return self._composed(canonical, children, outputs), Deformation(outputs, extent)
+
+    def _composed(self, canonical: Tensor, children: Children, deformation: Tensor | None) -> list[Posed]:
+        extent, projected = float(self.extent), self.config.projected_clip
+        return compose(canonical, children, deformation, extent, projected_clip=projected)
 
     def _predicted_deformation(
         self, slot_indices: Tensor, canonical_means: Tensor, times: Sequence[float]
-    ) -> list[Tensor]:
-        """Output of DeformNet per child at each time; with anchor deformation all children of an anchor share it."""
+    ) -> Float[Tensor, "gaussian time 10"]:
+        """Output of DeformNet; with anchor deformation all children of an anchor share it."""
         assert self.deformation is not None
         time_rows = torch.tensor(times, dtype=canonical_means.dtype).unsqueeze(-1)
         if self.config.deformation == "anchor":
             anchors, owners = torch.unique(slot_indices // self.scaffold.slots, return_inverse=True)
             positions = self.network_positions(self.scaffold.anchors.index_select(0, anchors))
-            shared = self.deformation(positions, time_rows)
-            return [raw.index_select(0, owners) for raw in shared.unbind(0)]
-        return list(self.deformation(self.network_positions(canonical_means), time_rows).unbind(0))
+            shared: Tensor = self.deformation(positions, time_rows)
+            return shared.index_select(0, owners)
+        outputs: Tensor = self.deformation(self.network_positions(canonical_means), time_rows)
+        return outputs
 
     def _single_mlp(self, single: SingleMLP, children: Children, canonical_means: Tensor, time: float | None) -> Tensor:
         time_row = None if time is None else torch.tensor([time], dtype=canonical_means.dtype)

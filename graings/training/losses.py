@@ -33,8 +33,8 @@ def temporal(
 
 
 def deformation(offsets: Deformation) -> Tensor:
-    """Mean squared magnitude of all geometric offsets, Eq. 17; rotation as its distance from none."""
-    return mean_square(offsets.offsets)
+    """Mean over times and Gaussians of the squared size of all offsets, Eq. 17; rotation as its distance from none."""
+    return mean_square(offsets.outputs.flatten(0, 1), offsets.units)
 
 
 def residual(change: Float[Tensor, "gaussian 4"]) -> Tensor:
@@ -73,9 +73,9 @@ def rigidity(lengths: Float[Tensor, "instant pair"], weights: Float[Tensor, " pa
     return (cost.mean(0) * weights).sum() / weights.sum().clamp_min(1.0)
 
 
-def mean_square(rows: Float[Tensor, "row _"]) -> Tensor:
-    """Mean over at least one row of its squared length."""
-    total: Tensor = _SquaredLength.apply(rows)  # type: ignore[no-untyped-call]
+def mean_square(rows: Float[Tensor, "row width"], units: Float[Tensor, " width"] | None = None) -> Tensor:
+    """Mean over at least one row of its squared length; with `units` of each row's product with them."""
+    total: Tensor = _SquaredLength.apply(rows, units)  # type: ignore[no-untyped-call]
     return total / len(rows)
 
 
@@ -83,13 +83,12 @@ class _SquaredLength(torch.autograd.Function):
     """Sum of squares. The backward pass of square().sum() goes through memory five times, this one once."""
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor) -> Tensor:
-        ctx.save_for_backward(values)
-        return torch.linalg.vector_norm(values.detach()).square()
+    def forward(ctx: Any, rows: Tensor, units: Tensor | None) -> Tensor:
+        ctx.save_for_backward(rows, units)
+        return torch.linalg.vector_norm(rows.detach() if units is None else rows.detach() * units).square()
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor) -> Tensor:
-        (values,) = ctx.saved_tensors
-        gradient: Tensor = values * (2 * upstream[0])
-        return gradient
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        rows, units = ctx.saved_tensors
+        return rows * (2 * upstream[0] if units is None else units.square() * (2 * upstream[0])), None

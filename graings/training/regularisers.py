@@ -54,9 +54,9 @@ def regularisers(
         total = total + config.temporal * pairs * _temporal(scene, first, moments[0], times, share, generator)
     if config.rigidity > 0:
         total = total + config.rigidity * _rigidity(compositions, float(scene.extent), streams["child_pairs"])
+    if first.deformation is not None and config.deformation > 0:
+        total = total + config.deformation * losses.deformation(first.deformation)
     for one in compositions:
-        if one.deformation is not None and config.deformation > 0:
-            total = total + config.deformation * losses.deformation(one.deformation) / len(compositions)
         if one.residual is not None and config.residual > 0:
             total = total + config.residual * losses.residual(one.residual) / len(compositions)
     return total
@@ -71,7 +71,7 @@ def _temporal(
     generator: torch.Generator,
 ) -> Tensor:
     """Eq. 16 between this frame's time and one neighbouring training time, on a sample of the children."""
-    assert composition.deformation is not None
+    assert composition.position_offsets is not None
     here = int(abs(times - time).argmin())
     side = 1 if int(torch.randint(2, (1,), generator=generator)) else -1
     there = here + side if 0 <= here + side < len(times) else here - side
@@ -82,12 +82,13 @@ def _temporal(
     assert neighbour is not None
     gap = abs(float(times[there] - times[here]))
     mean_gap = float(times[-1] - times[0]) / (len(times) - 1)
-    return losses.temporal(composition.deformation.position[sample], neighbour.position, gap, mean_gap)
+    now, then = composition.position_offsets[sample], neighbour.position_offsets(0)
+    return losses.temporal(now, then, gap, mean_gap)
 
 
 def _rigidity(compositions: Sequence[Composition], extent: float, generator: torch.Generator) -> Tensor:
     """Strain of distances between children over the times of a step; canonical positions get no gradient."""
-    offsets = [one.deformation.position for one in compositions if one.deformation is not None]
+    offsets = [one.position_offsets for one in compositions if one.position_offsets is not None]
     canonical = compositions[0].canonical_means.detach()
     step = int(torch.randint(1, REACH + 1, (1,), generator=generator))
     if len(offsets) < 2 or len(canonical) <= step:

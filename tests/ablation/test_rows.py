@@ -126,9 +126,8 @@ def _reached_by_motion(name: str) -> bool:
     """Whether a gradient on the offsets in time reaches where the children lie."""
     scene = _model(name)
     composition = scene.compose(EYE, 0.4)
-    moved = composition.deformation
-    assert moved is not None
-    moved.position.square().sum().backward()
+    assert composition.position_offsets is not None
+    composition.position_offsets.square().sum().backward()
     gradient = scene.scaffold.offsets.grad
     return gradient is not None and bool(gradient.abs().max() > 0)
 
@@ -143,11 +142,11 @@ def test_only_deformation_per_anchor_moves_all_children_of_an_anchor_alike(name:
     scene = _model(name)
     with torch.no_grad():
         composition = scene.compose(EYE, 0.4)
-    assert composition.deformation is not None
+    assert composition.position_offsets is not None
     owners = composition.children // scene.scaffold.slots
     siblings = owners[1:] == owners[:-1]
     assert siblings.any()
-    steps = composition.deformation.position.diff(dim=0).abs().amax(-1)[siblings]
+    steps = composition.position_offsets.diff(dim=0).abs().amax(-1)[siblings]
     assert bool((steps == 0).all()) is shared
 
 

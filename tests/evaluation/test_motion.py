@@ -74,7 +74,9 @@ def test_a_scene_that_moves_is_followed() -> None:
         first = scene.compose(EYE, TIMES[0])
         means = first.gaussians.means.double().numpy()
         moved = [scene.deform(first.children, first.canonical_means, time) for time in TIMES]
-    offsets = np.stack([deformation.position.double().numpy() for deformation in moved if deformation is not None])
+    offsets = np.stack(
+        [deformation.position_offsets(0).double().numpy() for deformation in moved if deformation is not None]
+    )
     metrics = measure_motion(scene, EYE, TIMES, means + offsets - offsets[0])
     assert metrics is not None
     assert metrics.mean_at_rest > 0.001

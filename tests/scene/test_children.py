@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -14,6 +15,7 @@ from graings.scene.children import (
     LOG_SCALE_RANGE,
     MAX_LOG_SCALE_OFFSET,
     Children,
+    Posed,
     compose,
     gather,
     plain_compose,
@@ -23,6 +25,7 @@ from graings.scene.children import (
 from graings.scene.scaffold import Scaffold
 
 SLOTS = 3
+TIMES = 3
 
 NetworkOutputs = tuple[Tensor, Children, Tensor | None]
 
@@ -44,7 +47,7 @@ def network_outputs(count: int, dtype: torch.dtype, *, moves: bool) -> NetworkOu
     def numbers(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=random, dtype=torch.float64).to(dtype)
 
-    canonical, deformation = numbers(count, 7), numbers(count, 10) * 2
+    canonical, deformation = numbers(count, 7), numbers(count, TIMES, 10) * 2
     canonical[0, :4] = torch.tensor([-1.0, 0.0, 0.0, 0.0])
     canonical[1, 4:], canonical[2, 4:] = 9.0, -30.0
     return (
@@ -67,9 +70,7 @@ def gathered(function: Callable[..., Children], given: Scaffold, children: Tenso
     return [*(v.detach() for v in values), given.log_scales.grad, given.offsets.grad]  # type: ignore[list-item]
 
 
-def composed(
-    function: Callable[..., tuple[Tensor, ...]], given: NetworkOutputs, *, projected: bool = True
-) -> list[Tensor]:
+def composed(function: Callable[..., list[Posed]], given: NetworkOutputs, *, projected: bool = True) -> list[Tensor]:
     canonical, children, deformation = given
     inputs = (canonical, children.anchor_log_scales, children.canonical_means)
     leaves = [t.clone().requires_grad_() for t in inputs]
@@ -77,7 +78,8 @@ def composed(
         leaves.append(deformation.clone().requires_grad_())
     copies = Children(children.anchors, children.inputs, leaves[2], leaves[1])
     offsets = leaves[3] if deformation is not None else None
-    values = function(leaves[0], copies, offsets, 1.7, projected_clip=projected)
+    posed = function(leaves[0], copies, offsets, 1.7, projected_clip=projected)
+    values = [value for one in posed for value in one if value is not None]
     random = torch.Generator().manual_seed(4)
     upstream = [torch.randn(v.shape, generator=random, dtype=torch.float64).to(v.dtype) for v in values]
     return [*(v.detach() for v in values), *torch.autograd.grad(values, leaves, upstream)]
@@ -106,36 +108,61 @@ def test_compose_equals_plain_torch(moves: bool, projected: bool, dtype: torch.d
     given = network_outputs(3000, dtype, moves=moves)
     ours, plain = (composed(f, given, projected=projected) for f in (compose, plain_compose))
     # The zero quaternion has derivatives of 1e12, which would hide all others in the norm: they need only be finite.
+    first_gradient = 4 * TIMES if moves else 3
     for values in (ours, plain):
-        assert values[3][0, :4].isfinite().all()
-        values[3][0, :4] = 0
+        assert values[first_gradient][0, :4].isfinite().all()
+        values[first_gradient][0, :4] = 0
     assert_close(ours, plain, relative)
 
 
 def test_log_scales_stay_within_their_bounds() -> None:
-    _, _, log_scales = compose(*network_outputs(50, torch.float32, moves=True), 1.0, projected_clip=True)
-    assert log_scales.min() >= LOG_SCALE_RANGE[0]
-    assert log_scales.max() <= LOG_SCALE_RANGE[1]
+    for posed in compose(*network_outputs(50, torch.float32, moves=True), 1.0, projected_clip=True):
+        assert posed.log_scales.min() >= LOG_SCALE_RANGE[0]
+        assert posed.log_scales.max() <= LOG_SCALE_RANGE[1]
     child = Children(torch.zeros(1, dtype=torch.int64), torch.zeros(1, 1), torch.zeros(1, 3), torch.zeros(1, 3))
-    deformation = torch.tensor([[0.0] * 7 + [3.0, 0.5, -9.0]])
-    _, _, log_scales = compose(torch.zeros(1, 7), child, deformation, 1.0, projected_clip=True)
-    assert torch.equal(log_scales, torch.tensor([[MAX_LOG_SCALE_OFFSET, 0.5, -MAX_LOG_SCALE_OFFSET]]))
+    deformation = torch.tensor([[[0.0] * 7 + [3.0, 0.5, -9.0]]])
+    (posed,) = compose(torch.zeros(1, 7), child, deformation, 1.0, projected_clip=True)
+    assert torch.equal(posed.log_scales, torch.tensor([[MAX_LOG_SCALE_OFFSET, 0.5, -MAX_LOG_SCALE_OFFSET]]))
 
 
 def test_a_nan_is_not_hidden_by_a_clip() -> None:
     canonical, children, deformation = network_outputs(5, torch.float32, moves=True)
     canonical[3] = torch.nan
-    means, quats, log_scales = compose(canonical, children, deformation, 1.0, projected_clip=True)
-    assert quats[3].isnan().all()
-    assert log_scales[3].isnan().all()
-    assert means.isfinite().all()
+    for posed in compose(canonical, children, deformation, 1.0, projected_clip=True):
+        assert posed.quats[3].isnan().all()
+        assert posed.log_scales[3].isnan().all()
+        assert posed.means.isfinite().all()
+
+
+@pytest.mark.parametrize("used", range(4))
+def test_outputs_that_a_loss_does_not_use_add_nothing_to_gradients(used: int) -> None:
+    """Of the second time only one output is used: the others reach the backward pass as no gradient at all."""
+    gradients = []
+    for function in (compose, plain_compose):
+        canonical, children, deformation = network_outputs(400, torch.float64, moves=True)
+        leaves = [canonical[1:].requires_grad_(), deformation[1:].requires_grad_()]  # type: ignore[index]
+        rows = Children(*(t[1:] for t in dataclasses.astuple(children)))
+        value = function(leaves[0], rows, leaves[1], 1.7, projected_clip=True)[1][used]
+        found = torch.autograd.grad(value.sin().sum(), leaves, allow_unused=True)
+        gradients.append([torch.zeros_like(t) if g is None else g for g, t in zip(found, leaves, strict=True)])
+    assert_close(*gradients, relative=1e-13)
+    assert not gradients[0][1][:, [0, 2]].any()
+
+
+def test_times_composed_together_are_those_composed_alone() -> None:
+    canonical, children, deformation = network_outputs(500, torch.float32, moves=True)
+    assert deformation is not None
+    together = compose(canonical, children, deformation, 1.3, projected_clip=True)
+    for time, posed in enumerate(together):
+        (alone,) = compose(canonical, children, deformation[:, time : time + 1], 1.3, projected_clip=True)
+        assert all(torch.equal(a, b) for a, b in zip(posed, alone, strict=True))
 
 
 def test_gradcheck_passes() -> None:
     given = scaffold(6)
     children = random_slots(6, 0.6)
     random = torch.Generator().manual_seed(1)
-    deformation = torch.randn(len(children), 10, generator=random, dtype=torch.float64) * 0.3
+    deformation = torch.randn(len(children), TIMES, 10, generator=random, dtype=torch.float64) * 0.3
     canonical = torch.randn(len(children), 7, generator=random, dtype=torch.float64) * 0.3
 
     def through(*values: Tensor) -> tuple[Tensor, ...]:
@@ -144,8 +171,8 @@ def test_gradcheck_passes() -> None:
             delattr(holder, name)
             setattr(holder, name, value)
         gathered_children = gather(holder, children)
-        geometry = compose(values[2], gathered_children, values[3], 1.3, projected_clip=False)
-        return (*geometry, gathered_children.inputs)
+        posed = compose(values[2], gathered_children, values[3], 1.3, projected_clip=False)
+        return (*(value for one in posed for value in one), gathered_children.inputs)
 
     leaves = [t.detach().clone().requires_grad_() for t in (given.log_scales, given.offsets, canonical, deformation)]
     assert torch.autograd.gradcheck(through, leaves)

@@ -201,14 +201,13 @@ def test_the_motion_kernel_against_its_oracle(anchors: int, slots: int, dtype: t
         rows = children[torch.rand(len(children), generator=random) < 0.6]
         arrays = (ActiveUnits.of(hidden), in_blocks(unmoved(canonical, gathered)))
         found = move(*arrays, weights, bias, extent, rows)
-        same = compose(canonical, gathered, perceptron(hidden, [weights], [bias]), extent, projected_clip=True)
-        plain = plain_compose(
-            canonical, gathered, plain_perceptron(hidden, [weights], [bias]), extent, projected_clip=True
-        )
+        offsets = [function(hidden, [weights], [bias])[:, None] for function in (perceptron, plain_perceptron)]
+        (same,) = compose(canonical, gathered, offsets[0], extent, projected_clip=True)
+        (plain,) = plain_compose(canonical, gathered, offsets[1], extent, projected_clip=True)
     roundoff = 2.0**-24 if dtype == torch.float32 else 2.0**-53
     # |sum| of `width` products of at most 1 x max |w|, twice its rounding, times a quaternion of length 1 or the extent
     bound = 4 * extent * (width + 4) * roundoff * float((weights.abs().sum(1) + bias.abs()).max() + 3)
-    for part, exact, oracle in zip(found, same, plain, strict=True):
+    for part, exact, oracle in zip(found, same[:3], plain[:3], strict=True):
         assert torch.equal(part, exact[rows])
         torch.testing.assert_close(part, oracle[rows], rtol=0, atol=bound)
 

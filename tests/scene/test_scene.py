@@ -56,7 +56,7 @@ def test_deformation_sends_no_gradient_to_the_scaffold() -> None:
     composition = scene.compose(EYE, 0.4)
     deformation = composition.deformation
     assert deformation is not None
-    deformation.offsets.sum().backward()
+    deformation.offsets(0).sum().backward()
     assert all(parameter.grad is None for parameter in scene.scaffold.parameters())
     assert scene.deformation is not None
     assert scene.deformation.out.weight.grad is not None
@@ -109,7 +109,7 @@ def test_residual_of_colour_depends_on_the_view_as_configured_and_that_of_opacit
 def test_children_move_independently_unless_deformation_is_per_anchor() -> None:
     for mode, spread in (("child", True), ("anchor", False)):
         composition = tiny_scene(deformation=mode).compose(EYE, 0.4)
-        offsets = composition.deformation.position.detach()
+        offsets = composition.position_offsets.detach()
         owners = composition.children // 3
         varies = any(
             not torch.allclose(offsets[owners == anchor], offsets[owners == anchor][:1], atol=1e-7)
@@ -177,7 +177,23 @@ def test_deform_gives_the_deformation_of_the_composition() -> None:
     scene = tiny_scene()
     composition = scene.compose(EYE, 0.4)
     again = scene.deform(composition.children, composition.canonical_means, 0.4)
-    assert torch.equal(again.position, composition.deformation.position)
+    assert torch.equal(again.outputs, composition.deformation.outputs)
+    assert torch.equal(again.position_offsets(0), composition.position_offsets)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"deformation": "anchor"}, {"time_conditioning": "concatenated"}, {"single_mlp": True}]
+)
+def test_views_composed_together_have_their_own_times(options: dict[str, object]) -> None:
+    scene = tiny_scene(**options)
+    times = (0.1, 0.4, 0.9)
+    together = scene.compose_together([(EYE, time) for time in times])
+    for index, (time, composition) in enumerate(zip(times, together, strict=True)):
+        alone = scene.deform(composition.children, composition.canonical_means, time)
+        torch.testing.assert_close(composition.deformation.offsets(index), alone.offsets(0))
+        torch.testing.assert_close(composition.position_offsets, alone.position_offsets(0))
+        moved = composition.canonical_means + composition.position_offsets
+        torch.testing.assert_close(composition.gaussians.means, moved)
 
 
 def test_projected_clip_blocks_only_gradients_that_point_outwards() -> None:

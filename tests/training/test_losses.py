@@ -7,18 +7,23 @@ import torch
 
 from graings.config import LossConfig
 from graings.random import RandomStreams
-from graings.scene.deformation import deformation_from
+from graings.scene.deformation import Deformation
 from graings.training import losses, regularisers
 from tests.models import EYE, tiny_scene
 
 RAW = torch.randn(7, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
 
-def test_deformation_is_the_mean_over_gaussians_of_the_squared_offsets() -> None:
-    moved = deformation_from(RAW, extent=2.5)
+def test_deformation_is_the_mean_over_times_and_gaussians_of_the_squared_offsets() -> None:
+    moved = Deformation(torch.stack([RAW, 2 * RAW, -RAW.flip(0)], dim=1).requires_grad_(), extent=2.5)
+    rows = [moved.offsets(index) for index in range(3)]
     sizes = [sum((2.5 if i < 3 else 1.0) ** 2 * float(x) ** 2 for i, x in enumerate(row)) for row in RAW]
-    assert float(losses.deformation(moved)) == pytest.approx(sum(sizes) / 7, rel=1e-14)
-    assert torch.equal(moved.position, 2.5 * RAW[:, :3])
+    assert losses.deformation(moved).item() == pytest.approx((1 + 4 + 1) * sum(sizes) / (3 * 7), rel=1e-14)
+    assert torch.equal(moved.position_offsets(1), 2.5 * 2 * RAW[:, :3])
+    assert torch.equal(moved.position_offsets(2), rows[2][:, :3])
+    plain = sum(row.square().sum() for row in rows) / (3 * 7)
+    gradients = [torch.autograd.grad(loss, moved.outputs)[0] for loss in (losses.deformation(moved), plain)]
+    torch.testing.assert_close(*gradients, rtol=1e-13, atol=0)
 
 
 def test_temporal_weighs_a_wide_pair_less() -> None:

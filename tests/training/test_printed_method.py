@@ -216,8 +216,8 @@ def test_the_loss_of_a_step_is_the_sum_of_the_four_printed_terms(micro: Path) ->
         assert composition.residual is not None
         expected = (
             photometric(image.color, torch.from_numpy(trainer.images.rgb(frame)), 0.2)
-            + 0.01 * (len(times) - 1) * _square(there.position - here.position)
-            + 0.001 * _square(here.offsets)
+            + 0.01 * (len(times) - 1) * _square(there.position_offsets(0) - here.position_offsets(0))
+            + 0.001 * _square(here.offsets(0))
             + 0.01 * _square(composition.residual)
         )
         torch.testing.assert_close(found.total, expected, rtol=1e-5, atol=1e-8)

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from graings.config import LossConfig
 from graings.random import RandomStreams
-from graings.scene.deformation import Deformation
 from graings.scene.scene import Composition, Scene
 from graings.training import losses
 from graings.training.regularisers import regularisers
@@ -32,8 +31,7 @@ def placed(compositions: list[Composition], places: list[Tensor]) -> list[Compos
     """The compositions with their children moved to `places`."""
     moved = []
     for one, where in zip(compositions, places, strict=True):
-        offsets = torch.cat([where - one.canonical_means.detach(), torch.zeros(len(where), 7)], dim=1)
-        moved.append(dataclasses.replace(one, deformation=Deformation(offsets)))
+        moved.append(dataclasses.replace(one, position_offsets=where - one.canonical_means.detach()))
     return moved
 
 

@@ -49,8 +49,21 @@ template <class R>
 graings::NetworkOutputs<R> network_outputs(const In<R>& canonical, const In<R>& base, const In<R>& centre, const std::optional<In<R>>& deformation, double extent, double change,
                             double low, double high, bool projected) {
     const size_t drawn = base.shape(0);
-    return {int64_t(drawn), checked(canonical, 7 * drawn, "canonical"), checked(base, 3 * drawn, "base"), checked(centre, 3 * drawn, "centre"),
-            checked(deformation, 10 * drawn, "deformation"), extent, {change, low, high, projected}};
+    if (deformation && deformation->ndim() != 3) throw std::invalid_argument("deformation must be [gaussian, time, 10]");
+    const size_t times = deformation ? deformation->shape(1) : 1;
+    return {int64_t(drawn), int64_t(times), checked(canonical, 7 * drawn, "canonical"), checked(base, 3 * drawn, "base"), checked(centre, 3 * drawn, "centre"),
+            checked(deformation, 10 * drawn * times, "deformation"), extent, {change, low, high, projected}};
+}
+
+// Of each time; None is zero.
+template <class R> using Gradients = std::vector<std::optional<In<R>>>;
+
+template <class R>
+std::vector<const R*> of_each_time(const Gradients<R>& arrays, const graings::NetworkOutputs<R>& in, size_t width, const char* name) {
+    if (arrays.size() != size_t(in.times)) throw std::invalid_argument(std::string(name) + " must have an array or None for each time");
+    std::vector<const R*> pointers;
+    for (const auto& array : arrays) pointers.push_back(checked(array, width * size_t(in.drawn), name));
+    return pointers;
 }
 
 template <class R>
@@ -81,22 +94,27 @@ void bind_children(nb::module_& m) {
         graings::gather_gradient<R>(from, int64_t(drawn), children.data(), row, centre, base, scales, offsets, threads);
     });
     m.def("compose", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> deformation, double extent, double change, double low, double high, bool projected,
-                        Out<R> mean, Out<R> quat, Out<R> log_scale, int threads) {
+                        Out<R> mean, Out<R> quat, Out<R> log_scale, std::optional<Out<R>> shift, int threads) {
         const auto in = network_outputs<R>(canonical, base, centre, deformation, extent, change, low, high, projected);
-        const size_t drawn = size_t(in.drawn);
-        R *means = checked(mean, 3 * drawn, "mean"), *quats = checked(quat, 4 * drawn, "quat"), *scales = checked(log_scale, 3 * drawn, "log_scale");
+        const size_t rows = size_t(in.drawn * in.times);
+        R *means = checked(mean, 3 * rows, "mean"), *quats = checked(quat, 4 * rows, "quat"), *scales = checked(log_scale, 3 * rows, "log_scale");
+        R* shifts = checked(shift, 3 * rows, "shift");
+        if (bool(shifts) != bool(in.deformation)) throw std::invalid_argument("deformation and shift must be given together");
         nb::gil_scoped_release release;
-        graings::compose<R>(in, means, quats, scales, threads);
+        graings::compose<R>(in, means, quats, scales, shifts, threads);
     });
     m.def("compose_gradient", [](In<R> canonical, In<R> base, In<R> centre, std::optional<In<R>> deformation, double extent, double change, double low, double high,
-                                 bool projected, In<R> v_mean, In<R> v_quat, In<R> v_log_scale, Out<R> v_canonical, std::optional<Out<R>> v_deformation, int threads) {
+                                 bool projected, Gradients<R> v_mean, Gradients<R> v_quat, Gradients<R> v_log_scale, Gradients<R> v_shift, Out<R> v_canonical,
+                                 Out<R> v_base, Out<R> v_centre, std::optional<Out<R>> v_deformation, int threads) {
         const auto in = network_outputs<R>(canonical, base, centre, deformation, extent, change, low, high, projected);
         const size_t drawn = size_t(in.drawn);
-        const R *means = checked(v_mean, 3 * drawn, "v_mean"), *quats = checked(v_quat, 4 * drawn, "v_quat"), *scales = checked(v_log_scale, 3 * drawn, "v_log_scale");
-        R *out = checked(v_canonical, 7 * drawn, "v_canonical"), *out_deformation = checked(v_deformation, 10 * drawn, "v_deformation");
+        const graings::GeometryGradients<R> upstream{of_each_time<R>(v_mean, in, 3, "v_mean"), of_each_time<R>(v_quat, in, 4, "v_quat"),
+                                                     of_each_time<R>(v_log_scale, in, 3, "v_log_scale"), of_each_time<R>(v_shift, in, 3, "v_shift")};
+        R *out = checked(v_canonical, 7 * drawn, "v_canonical"), *out_deformation = checked(v_deformation, 10 * drawn * size_t(in.times), "v_deformation");
+        R *out_base = checked(v_base, 3 * drawn, "v_base"), *out_centre = checked(v_centre, 3 * drawn, "v_centre");
         if (bool(out_deformation) != bool(in.deformation)) throw std::invalid_argument("deformation and v_deformation must be given together");
         nb::gil_scoped_release release;
-        graings::compose_gradient<R>(in, means, quats, scales, out, out_deformation, threads);
+        graings::compose_gradient<R>(in, upstream, out, out_base, out_centre, out_deformation, threads);
     });
 }
 

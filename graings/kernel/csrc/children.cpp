@@ -104,52 +104,68 @@ void gather_gradient(const Anchors<R>& anchors, int64_t drawn, const int64_t* ch
 }
 
 template <class R>
-void compose(const NetworkOutputs<R>& in, R* mean, R* quat, R* log_scale, int threads) {
+void compose(const NetworkOutputs<R>& in, R* mean, R* quat, R* log_scale, R* shift, int threads) {
     const R extent = R(in.extent), change = R(in.bounds.change), low = R(in.bounds.low), high = R(in.bounds.high);
     in_pieces(threads, in.drawn, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i++) {
-            const R* deformation = in.deformation ? in.deformation + 10 * i : nullptr;
             R norm;
-            Quat<R> q = canonical(in.canonical + 7 * i, norm);
-            if (deformation) q = product(q, deformed_rotation(deformation));
-            quat[4 * i] = q.w, quat[4 * i + 1] = q.x, quat[4 * i + 2] = q.y, quat[4 * i + 3] = q.z;
-            for (int c = 0; c < 3; c++) {
-                R scale = in.base[3 * i + c] + in.canonical[7 * i + 4 + c];
-                mean[3 * i + c] = in.centre[3 * i + c];
-                if (deformation) mean[3 * i + c] += deformation[c] * extent, scale += clip(deformation[7 + c], -change, change);
-                log_scale[3 * i + c] = clip(scale, low, high);
+            const Quat<R> still = canonical(in.canonical + 7 * i, norm);
+            for (int64_t t = 0; t < in.times; t++) {
+                const R* deformation = in.deformation ? in.deformation + 10 * (in.times * i + t) : nullptr;
+                const int64_t to = t * in.drawn + i;
+                const Quat<R> q = deformation ? product(still, deformed_rotation(deformation)) : still;
+                quat[4 * to] = q.w, quat[4 * to + 1] = q.x, quat[4 * to + 2] = q.y, quat[4 * to + 3] = q.z;
+                for (int c = 0; c < 3; c++) {
+                    R scale = in.base[3 * i + c] + in.canonical[7 * i + 4 + c];
+                    mean[3 * to + c] = in.centre[3 * i + c];
+                    if (deformation) {
+                        shift[3 * to + c] = deformation[c] * extent;
+                        mean[3 * to + c] += shift[3 * to + c], scale += clip(deformation[7 + c], -change, change);
+                    }
+                    log_scale[3 * to + c] = clip(scale, low, high);
+                }
             }
         }
     });
 }
 
 template <class R>
-void compose_gradient(const NetworkOutputs<R>& in, const R* v_mean, const R* v_quat, const R* v_log_scale, R* v_canonical, R* v_deformation, int threads) {
+void compose_gradient(const NetworkOutputs<R>& in, const GeometryGradients<R>& v, R* v_canonical, R* v_base, R* v_centre, R* v_deformation, int threads) {
     const R extent = R(in.extent), change = R(in.bounds.change), low = R(in.bounds.low), high = R(in.bounds.high);
     in_pieces(threads, in.drawn, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i++) {
-            const R* deformation = in.deformation ? in.deformation + 10 * i : nullptr;
             R norm;
             const Quat<R> q = canonical(in.canonical + 7 * i, norm);
-            Quat<R> v{v_quat[4 * i], v_quat[4 * i + 1], v_quat[4 * i + 2], v_quat[4 * i + 3]};
-            if (deformation) {
-                // the adjoint of multiplication by a quaternion is multiplication by its conjugate
-                const Quat<R> t = product(conjugate(q), v);
-                v_deformation[10 * i + 3] = t.w, v_deformation[10 * i + 4] = t.x, v_deformation[10 * i + 5] = t.y, v_deformation[10 * i + 6] = t.z;
-                v = product(v, conjugate(deformed_rotation(deformation)));
+            Quat<R> sum{R(0), R(0), R(0), R(0)};
+            R scales[3] = {}, centre[3] = {};
+            for (int64_t t = 0; t < in.times; t++) {
+                const int64_t row = 10 * (in.times * i + t);
+                const R* deformation = in.deformation ? in.deformation + row : nullptr;
+                Quat<R> v_quat{R(0), R(0), R(0), R(0)};
+                if (const R* from = v.quat[t]) v_quat = {from[4 * i], from[4 * i + 1], from[4 * i + 2], from[4 * i + 3]};
+                if (deformation) {
+                    // the adjoint of multiplication by a quaternion is multiplication by its conjugate
+                    const Quat<R> turn = product(conjugate(q), v_quat);
+                    R* to = v_deformation + row + 3;
+                    to[0] = turn.w, to[1] = turn.x, to[2] = turn.y, to[3] = turn.z;
+                    v_quat = product(v_quat, conjugate(deformed_rotation(deformation)));
+                }
+                sum = {sum.w + v_quat.w, sum.x + v_quat.x, sum.y + v_quat.y, sum.z + v_quat.z};
+                for (int c = 0; c < 3; c++) {
+                    R scale = in.base[3 * i + c] + in.canonical[7 * i + 4 + c];
+                    if (deformation) scale += clip(deformation[7 + c], -change, change);
+                    const R g = clip_gradient(v.log_scale[t] ? v.log_scale[t][3 * i + c] : R(0), scale, low, high, in.bounds.projected);
+                    const R v_mean = v.mean[t] ? v.mean[t][3 * i + c] : R(0), v_shift = v.shift[t] ? v.shift[t][3 * i + c] : R(0);
+                    scales[c] += g, centre[c] += v_mean;
+                    if (!deformation) continue;
+                    v_deformation[row + c] = (v_mean + v_shift) * extent;
+                    v_deformation[row + 7 + c] = clip_gradient(g, deformation[7 + c], -change, change, in.bounds.projected);
+                }
             }
-            const R along = norm > R(kLeastNorm) ? v.w * q.w + v.x * q.x + v.y * q.y + v.z * q.z : R(0);
+            const R along = norm > R(kLeastNorm) ? sum.w * q.w + sum.x * q.x + sum.y * q.y + sum.z * q.z : R(0);
             R* to = v_canonical + 7 * i;
-            to[0] = (v.w - along * q.w) / norm, to[1] = (v.x - along * q.x) / norm, to[2] = (v.y - along * q.y) / norm, to[3] = (v.z - along * q.z) / norm;
-            for (int c = 0; c < 3; c++) {
-                R scale = in.base[3 * i + c] + in.canonical[7 * i + 4 + c];
-                if (deformation) scale += clip(deformation[7 + c], -change, change);
-                const R g = clip_gradient(v_log_scale[3 * i + c], scale, low, high, in.bounds.projected);
-                to[4 + c] = g;
-                if (!deformation) continue;
-                v_deformation[10 * i + c] = v_mean[3 * i + c] * extent;
-                v_deformation[10 * i + 7 + c] = clip_gradient(g, deformation[7 + c], -change, change, in.bounds.projected);
-            }
+            to[0] = (sum.w - along * q.w) / norm, to[1] = (sum.x - along * q.x) / norm, to[2] = (sum.y - along * q.y) / norm, to[3] = (sum.z - along * q.z) / norm;
+            std::copy_n(scales, 3, to + 4), std::copy_n(scales, 3, v_base + 3 * i), std::copy_n(centre, 3, v_centre + 3 * i);
         }
     });
 }
@@ -157,8 +173,8 @@ void compose_gradient(const NetworkOutputs<R>& in, const R* v_mean, const R* v_q
 #define GRAINGS_INSTANTIATE(R)                                                                                                           \
     template void gather<R>(const Anchors<R>&, int64_t, const int64_t*, R*, R*, R*, int);                                                \
     template void gather_gradient<R>(const Anchors<R>&, int64_t, const int64_t*, const R*, const R*, const R*, R*, R*, int);              \
-    template void compose<R>(const NetworkOutputs<R>&, R*, R*, R*, int);                                                                        \
-    template void compose_gradient<R>(const NetworkOutputs<R>&, const R*, const R*, const R*, R*, R*, int);
+    template void compose<R>(const NetworkOutputs<R>&, R*, R*, R*, R*, int);                                                                    \
+    template void compose_gradient<R>(const NetworkOutputs<R>&, const GeometryGradients<R>&, R*, R*, R*, R*, int);
 GRAINGS_INSTANTIATE(float)
 GRAINGS_INSTANTIATE(double)
 #undef GRAINGS_INSTANTIATE

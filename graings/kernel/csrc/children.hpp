@@ -2,6 +2,7 @@
 // A child is the index anchor * slots + slot; children ascend, so that those of an anchor are contiguous.
 #pragma once
 #include <cstdint>
+#include <vector>
 
 namespace graings {
 
@@ -29,21 +30,27 @@ struct ScaleBounds {
 
 template <class R>
 struct NetworkOutputs {
-    int64_t drawn;
+    int64_t drawn, times;                // one time without a deformation
     const R *canonical, *base, *centre;  // [drawn, 7]: quaternion less the identity, log-scale less base; [drawn, 3] each
-    const R* deformation;                // [drawn, 10]: position in units of `extent`, rotation, log-scale; or null
+    const R* deformation;                // [drawn, times, 10]: position in units of `extent`, rotation, log-scale; or null
     double extent;
     ScaleBounds bounds;
 };
 
-// mean [drawn, 3] = centre + extent * position; quat [drawn, 4] = unit(1 + canonical) times 1 + rotation;
-// log_scale [drawn, 3] = base + canonical + change, both bounded (Eq. 5 and 10).
+// For each time, shift [times, drawn, 3] = extent * position, null without a deformation; mean [times, drawn, 3] = centre + shift;
+// quat [times, drawn, 4] = unit(1 + canonical) times 1 + rotation; log_scale [times, drawn, 3] = base + canonical + change,
+// both bounded (Eq. 5 and 10).
 template <class R>
-void compose(const NetworkOutputs<R>&, R* mean, R* quat, R* log_scale, int threads);
+void compose(const NetworkOutputs<R>&, R* mean, R* quat, R* log_scale, R* shift, int threads);
 
-// The adjoint; v_deformation is null if deformation is. The gradient of base equals that of the canonical log-scale, and
-// that of centre is v_mean.
+// Gradients of what `compose` writes, an array for each time; null is zero.
 template <class R>
-void compose_gradient(const NetworkOutputs<R>&, const R* v_mean, const R* v_quat, const R* v_log_scale, R* v_canonical, R* v_deformation, int threads);
+struct GeometryGradients {
+    std::vector<const R*> mean, quat, log_scale, shift;
+};
+
+// The adjoint; v_deformation is null if deformation is.
+template <class R>
+void compose_gradient(const NetworkOutputs<R>&, const GeometryGradients<R>&, R* v_canonical, R* v_base, R* v_centre, R* v_deformation, int threads);
 
 }  // namespace graings

@@ -27,4 +27,4 @@ def track_loss(scene: Scene, tracks: MotionTracks, moments: Sequence[float]) -> 
     offsets = scene.deformation(places, torch.tensor(moments, dtype=places.dtype).unsqueeze(-1))[..., :3]
     at_rest = torch.zeros(len(moments), len(tracks.rest), 3)
     wanted = torch.cat([tracks.displacements(moments), at_rest], dim=1) / scene.extent
-    return (offsets - wanted).abs().mean()
+    return (offsets.transpose(0, 1) - wanted).abs().mean()
