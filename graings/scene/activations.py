@@ -21,40 +21,31 @@ _SIGMOID, _TANH = 0, 1  # as in the kernel
 
 
 class _Activation(torch.autograd.Function):
-    """`values` of a sigmoid whose input and output are scaled by `stretch`: the derivative is stretch^2 E / (1 + E)^2.
-
-    E = exp(-stretch |x|).
-    """
-
     @staticmethod
-    def forward(ctx: Any, x: Tensor, values: Tensor, stretch: float) -> Tensor:
+    def forward(ctx: Any, x: Tensor, function: int, threads: int) -> Tensor:
+        x = x.detach().contiguous()
+        values = torch.empty_like(x)
+        kernel.call("activate", function, x, values, threads)
         ctx.save_for_backward(x)
-        ctx.stretch = stretch
+        ctx.function, ctx.threads = function, threads
         return values
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
-        exponential = (ctx.stretch * x).abs_().neg_().exp_()
-        derivative = exponential.div_((1.0 + exponential).square_())
-        return derivative.mul_(grad_outputs[0]).mul_(ctx.stretch**2), None, None
+        gradient = torch.empty_like(x)
+        kernel.call("activate_gradient", ctx.function, x, upstream[0].contiguous(), gradient, ctx.threads)
+        return gradient, None, None
 
 
 def tanh(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Hyperbolic tangent; its derivative is 4 E / (1 + E)^2 with E = exp(-2 |x|)."""
-    result: Tensor = _Activation.apply(x, _values(x, _TANH), 2.0)  # type: ignore[no-untyped-call]
+    result: Tensor = _Activation.apply(x, _TANH, kernel.thread_count())  # type: ignore[no-untyped-call]
     return result
 
 
 def sigmoid(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """1 / (1 + exp(-x)); its derivative is E / (1 + E)^2 with E = exp(-|x|)."""
-    result: Tensor = _Activation.apply(x, _values(x, _SIGMOID), 1.0)  # type: ignore[no-untyped-call]
+    result: Tensor = _Activation.apply(x, _SIGMOID, kernel.thread_count())  # type: ignore[no-untyped-call]
     return result
-
-
-def _values(x: Tensor, function: int) -> Tensor:
-    numbers = x.detach().contiguous()
-    values = torch.empty_like(numbers)
-    kernel.call("activate", function, numbers, values, kernel.thread_count())
-    return values

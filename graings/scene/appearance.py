@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from graings.config import SceneConfig
-from graings.scene.activations import sigmoid, tanh
+from graings.scene.activations import tanh
 from graings.scene.encoding import (
     direction_encoding,
     direction_width,
@@ -73,13 +73,10 @@ class CanonicalAppearance(nn.Module):
         directions = encodings * direction_width(self.color_sh_degree)
         return [weights[0][:, -directions:], weights[1]], [torch.zeros_like(biases[0]), biases[1]]
 
-    def colors(
-        self, part: ColorPart, directions: Float[Tensor, "anchor 3"], children: Int64[Tensor, " gaussian"]
-    ) -> Float[Tensor, "gaussian 3"]:
-        """c_can (Eq. 11) of the given flat child slots (anchor * k + child)."""
+    def colors(self, part: ColorPart, directions: Float[Tensor, "anchor 3"]) -> Float[Tensor, "slot 3"]:
+        """c_can (Eq. 11) of every child slot before its sigmoid."""
         inputs = direction_encoding(directions, self.color_sh_degree, part.normals)
-        raw = perceptron(inputs, *self.color_layers(part), shared=part.hidden)
-        return sigmoid(raw.view(-1, 3).index_select(0, children))
+        return perceptron(inputs, *self.color_layers(part), shared=part.hidden).view(-1, 3)
 
     def opacity_logits(
         self, features: Float[Tensor, "anchor feature"], directions: Float[Tensor, "anchor 3"]

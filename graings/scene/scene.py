@@ -24,8 +24,8 @@ from graings.random import torch_stream
 from graings.scene.activations import tanh
 from graings.scene.appearance import CanonicalAppearance, ResidualField
 from graings.scene.canonical import INITIAL_SCALE, StaticMLP, default_geometry
+from graings.scene.child_colors import child_colors
 from graings.scene.children import Children, Posed, compose, gather
-from graings.scene.clip import clip
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP
 from graings.scene.encoding import directions_from
 from graings.scene.scaffold import Scaffold
@@ -158,17 +158,19 @@ class Scene(nn.Module):
         posed, deformation = self.posed(children, slot_indices, times)
         per_view = zip(canonical_opacities, opacities, residuals, directions, posed, strict=True)
         for canonical_opacity, opacity, residual, direction, geometry in per_view:
-            colors = self.appearance.colors(color_part, direction, rendered)
-            rendered_residual = None
-            if residual_field is not None and residual is not None:
-                rendered_residual = residual_field.bounded(residual.flatten(0, 1).index_select(0, rendered))
-                colors = clip(colors + rendered_residual[:, :3], 0.0, 1.0, projected=config.projected_clip)
+            shown = child_colors(
+                self.appearance.colors(color_part, direction),
+                None if residual is None else residual.flatten(0, 1),
+                rendered,
+                config.residual_scale,
+                projected_clip=config.projected_clip,
+            )
             gaussians = Gaussians(
                 means=geometry.means,
                 quats=geometry.quats,
                 log_scales=geometry.log_scales,
                 opacities=opacity.flatten().index_select(0, rendered),
-                colors=colors,
+                colors=shown.colors,
                 uids=uids,
             )
             compositions.append(
@@ -178,7 +180,7 @@ class Scene(nn.Module):
                     canonical_means=children.canonical_means,
                     position_offsets=geometry.position_offsets,
                     deformation=deformation,
-                    residual=rendered_residual,
+                    residual=shown.residual,
                     opacities=canonical_opacity.detach().index_copy(0, candidates, opacity.detach()),
                     blur=config.blur,
                     sampling=self.sampling,

@@ -42,9 +42,8 @@ def canonical_opacities(scene: Scene) -> Tensor:
 def all_slots(scene: Scene) -> tuple[Tensor, Tensor]:
     """Scores [A, k] and colours [A k, 3] of every slot, rendered or not."""
     scaffold = scene.scaffold
-    slots = torch.arange(scaffold.count * scaffold.slots)
     scores = canonical_opacities(scene)
-    colors = scene.appearance.colors(scene.appearance.color_part(scaffold.features), scene.directions(EYE), slots)
+    colors = scene.appearance.colors(scene.appearance.color_part(scaffold.features), scene.directions(EYE)).sigmoid()
     if scene.residual is not None:
         time = torch.tensor([TIME], dtype=torch.float64)
         residual = ETA * torch.tanh(scene.residual(scene.residual.part(scaffold.features), time, scene.directions(EYE)))

@@ -48,6 +48,23 @@ static void activate(Activation kind, int64_t count, const R* x, R* out) {
     else in_groups<R>(count, [&](auto load, auto store) { store(out, tanh<R>(load(x))); });
 }
 
+// out = v times the derivative of the activation at x: s^2 E / (1 + E)^2 with E = exp(-s |x|), s = 2 for tanh, which is
+// positive where the value saturates. NaN passes.
+template <class R, int N> GRAINGS_INLINE Vec<R, N> activated_gradient(double s, Vec<double, N> x, Vec<double, N> v) {
+    const auto one = splat<double, N>(1), argument = splat<double, N>(-s) * abs(x), lowest = splat<double, N>(-708);
+    const auto e = select(argument < lowest, splat<double, N>(0), exp<double>(argument)), sum = one + e;
+    return rounded<R>(select(x <= x, v * splat<double, N>(s * s) * e / (sum * sum), x));
+}
+
+template <class R>
+static void activate_gradient(Activation kind, int64_t count, const R* x, const R* v, R* out) {
+    const double s = kind == kSigmoid ? 1 : 2;
+    in_groups<R>(count, [&](auto load, auto store) {
+        const auto at = load(x);
+        store(out, activated_gradient<R>(s, at, load(v)));
+    });
+}
+
 // Eq. 11 to 13: colors = sigmoid(colors), then clip(colors + bound tanh(residual)) where there is a residual.
 template <class R>
 static void finish_colors(int64_t count, R bound, const R* residual, R* colors) {

@@ -14,6 +14,7 @@
 
 #include "arrays.hpp"
 #include "children.hpp"
+#include "colors.hpp"
 #include "encoding.hpp"
 #include "frame.hpp"
 #include "isa.hpp"
@@ -67,6 +68,12 @@ std::vector<const R*> of_each_time(const Gradients<R>& arrays, const graings::Ne
 }
 
 template <class R>
+graings::ColorOutputs<R> color_outputs(const In<R>& color, const std::optional<In<R>>& residual, const In<int64_t>& children, double bound, bool projected) {
+    const size_t slots = color.size() / 3;
+    return {int64_t(slots), int64_t(children.size()), children.data(), checked(color, 3 * slots, "color"), checked(residual, 4 * slots, "residual"), bound, projected};
+}
+
+template <class R>
 graings::Products products_in(bool bfloat16) {
     if (bfloat16 && !std::is_same_v<R, float>) throw std::invalid_argument("products in bfloat16 are for float32");
     if (bfloat16) graings::bfloat16_kernels();  // throws where there are none
@@ -115,6 +122,26 @@ void bind_children(nb::module_& m) {
         if (bool(out_deformation) != bool(in.deformation)) throw std::invalid_argument("deformation and v_deformation must be given together");
         nb::gil_scoped_release release;
         graings::compose_gradient<R>(in, upstream, out, out_base, out_centre, out_deformation, threads);
+    });
+    m.def("child_colors", [](In<R> color, std::optional<In<R>> residual, In<int64_t> children, double bound, bool projected, std::optional<Out<R>> change, Out<R> sum,
+                             std::optional<Out<R>> drawn_color, int threads) {
+        const auto in = color_outputs<R>(color, residual, children, bound, projected);
+        const size_t drawn = children.size();
+        if (change.has_value() != residual.has_value() || drawn_color.has_value() != residual.has_value())
+            throw std::invalid_argument("residual, change and drawn_color must be given together");
+        R *changes = checked(change, 4 * drawn, "change"), *sums = checked(sum, 3 * drawn, "sum"), *to = checked(drawn_color, 3 * drawn, "drawn_color");
+        nb::gil_scoped_release release;
+        graings::child_colors<R>(in, changes, sums, to, threads);
+    });
+    m.def("child_colors_gradient", [](In<R> color, std::optional<In<R>> residual, In<int64_t> children, double bound, bool projected, In<R> sum,
+                                      std::optional<In<R>> v_drawn_color, std::optional<In<R>> v_change, Out<R> v_color, std::optional<Out<R>> v_residual, int threads) {
+        const auto in = color_outputs<R>(color, residual, children, bound, projected);
+        const size_t drawn = children.size();
+        if (v_residual.has_value() != residual.has_value()) throw std::invalid_argument("residual and v_residual must be given together");
+        const R *sums = checked(sum, 3 * drawn, "sum"), *colors = checked(v_drawn_color, 3 * drawn, "v_drawn_color"), *changes = checked(v_change, 4 * drawn, "v_change");
+        R *to = checked(v_color, color.size(), "v_color"), *to_residual = checked(v_residual, 4 * size_t(in.slots), "v_residual");
+        nb::gil_scoped_release release;
+        graings::child_colors_gradient<R>(in, sums, colors, changes, to, to_residual, threads);
     });
 }
 

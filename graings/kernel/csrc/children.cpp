@@ -4,6 +4,7 @@
 #include <cmath>
 #include <stdexcept>
 
+#include "clip.hpp"
 #include "pool.hpp"
 
 namespace graings {
@@ -48,17 +49,6 @@ Quat<R> canonical(const R* raw, R& norm) {
 }
 
 template <class R> Quat<R> deformed_rotation(const R* deformation) { return {deformation[3] + R(1), deformation[4], deformation[5], deformation[6]}; }
-
-// A NaN passes, so that later checks find it.
-template <class R> R clip(R x, R low, R high) { return x < low ? low : x > high ? high : x; }
-
-// The gradient through a clip of x.
-template <class R>
-R clip_gradient(R v, R x, R low, R high, bool projected) {
-    if (x > high) return projected && v > R(0) ? v : R(0);
-    if (x < low) return projected && v < R(0) ? v : R(0);
-    return v;
-}
 
 }  // namespace
 

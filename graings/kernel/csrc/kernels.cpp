@@ -14,7 +14,7 @@ namespace GRAINGS_ISA {
 template <class R>
 constexpr Kernels<R> table() {
     return {project<R>, draw_tile<R>, tile_gradient<R>, geometry_gradient<R>, ssim_values<R>, ssim_gradient<R>, network_values<R>, network_gradient<R>,
-            activate<R>, finish_colors<R>, move_children<R>, blend_children<R>};
+            activate<R>, activate_gradient<R>, finish_colors<R>, move_children<R>, blend_children<R>};
 }
 extern const Kernels<float> single_precision;
 extern const Kernels<double> double_precision;

@@ -87,6 +87,11 @@ void activate(Activation kind, int64_t count, const R* x, R* out, int threads) {
 }
 
 template <class R>
+void activate_gradient(Activation kind, int64_t count, const R* x, const R* v, R* out, int threads) {
+    in_pieces(threads, count, kPiece, [&](int, int64_t begin, int64_t end) { kernels<R>().activate_gradient(kind, end - begin, x + begin, v + begin, out + begin); });
+}
+
+template <class R>
 void directions(int64_t rows, const R* position, const double* eye, double nearest, R* out, int threads) {
     const R at[3] = {R(eye[0]), R(eye[1]), R(eye[2])};
     in_pieces(threads, rows, kPiece, [&](int, int64_t begin, int64_t end) {
@@ -203,6 +208,7 @@ void paint(const ColorNetworks<R>& in, const double* eye, double nearest, const 
 
 #define GRAINGS_INSTANTIATE(R)                                                                   \
     template void activate<R>(Activation, int64_t, const R*, R*, int);                           \
+    template void activate_gradient<R>(Activation, int64_t, const R*, const R*, R*, int);        \
     template void directions<R>(int64_t, const R*, const double*, double, R*, int);              \
     template int64_t choose<R>(const Shown<R>&, int64_t, const Rendered<R>&, int);                        \
     template void blend<R>(const BlendArgs<R>&, int64_t, int);                                   \

@@ -12,6 +12,10 @@ namespace graings {
 template <class R>
 void activate(Activation, int64_t count, const R* x, R* out, int threads);
 
+// out [count] = v times the derivative at x.
+template <class R>
+void activate_gradient(Activation, int64_t count, const R* x, const R* v, R* out, int threads);
+
 // out [rows, 3]: unit vectors from `eye` to the positions [rows, 3]; a distance below `nearest` counts as that.
 template <class R>
 void directions(int64_t rows, const R* position, const double* eye, double nearest, R* out, int threads);

@@ -24,13 +24,25 @@ graings::Network<R> head(const In<R>& hidden, int64_t anchors, const std::vector
     return result;
 }
 
+graings::Activation activation(int kind) {
+    if (kind != graings::kSigmoid && kind != graings::kTanh) throw std::invalid_argument("kind must be 0 (sigmoid) or 1 (tanh)");
+    return graings::Activation(kind);
+}
+
 template <class R>
 void bind(nb::module_& m) {
     m.def("activate", [](int kind, In<R> x, Out<R> out, int threads) {
         R* to = checked(out, x.size(), "out");
-        if (kind != graings::kSigmoid && kind != graings::kTanh) throw std::invalid_argument("kind must be 0 (sigmoid) or 1 (tanh)");
+        const auto function = activation(kind);
         nb::gil_scoped_release release;
-        graings::activate<R>(graings::Activation(kind), int64_t(x.size()), x.data(), to, threads);
+        graings::activate<R>(function, int64_t(x.size()), x.data(), to, threads);
+    });
+    m.def("activate_gradient", [](int kind, In<R> x, In<R> v, Out<R> out, int threads) {
+        const R* upstream = checked(v, x.size(), "v");
+        R* to = checked(out, x.size(), "out");
+        const auto function = activation(kind);
+        nb::gil_scoped_release release;
+        graings::activate_gradient<R>(function, int64_t(x.size()), x.data(), upstream, to, threads);
     });
     m.def("directions", [](In<R> position, In<double> eye, double nearest, Out<R> out, int threads) {
         const double* from = checked(eye, 3, "eye");

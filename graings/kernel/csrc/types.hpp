@@ -233,6 +233,7 @@ struct Kernels {
     void (*network_values)(const NetworkArgs<R>&, int64_t begin, int64_t end, R* scratch);
     void (*network_gradient)(const NetworkArgs<R>&, int64_t begin, int64_t end, R* sums, R* scratch);
     void (*activate)(Activation, int64_t count, const R* x, R* out);
+    void (*activate_gradient)(Activation, int64_t count, const R* x, const R* v, R* out);
     void (*finish_colors)(int64_t count, R bound, const R* residual, R* colors);  // residual may be null
     void (*move_children)(const MoveArgs<R>&, int64_t begin, int64_t end);
     void (*blend_children)(const BlendArgs<R>&, int64_t begin, int64_t end);  // blocks
