@@ -37,14 +37,14 @@ class DensityStatistics:
         `children` are flat slots, `screen_gradient` is dL/d(mean in pixels), `visible` says which Gaussians
         touched the image of `size` (width, height), `opacities` are those of every slot.
         """
-        half = torch.tensor([size[0] / 2.0, size[1] / 2.0], dtype=torch.float64)
-        norms = (screen_gradient.double() * half).norm(dim=-1)
-        seen = children[visible]
-        self.gradient.view(-1).index_add_(0, seen, norms[visible])
-        self.drawn.view(-1).index_add_(0, seen, torch.ones_like(seen))
+        # Adding zero for those that are not visible takes half the time of selecting the others.
+        x, y = (screen_gradient[:, axis].double() * (size[axis] / 2.0) for axis in (0, 1))
+        self.gradient.view(-1).index_add_(0, children, (x * x + y * y).sqrt_().masked_fill_(~visible, 0.0))
+        self.drawn.view(-1).index_add_(0, children, visible.long())
+        shown = torch.zeros(opacities.shape, dtype=torch.bool)
+        shown.view(-1)[children] = visible
         # An anchor without a drawn child counts as visited too: pruning needs its opacity.
-        visited = opacities.amax(dim=-1) <= constants.ALPHA_MIN
-        visited[seen // opacities.shape[1]] = True
+        visited = shown.any(dim=-1) | (opacities.amax(dim=-1) <= constants.ALPHA_MIN)
         self.visits += visited
         self.opacity += opacities.clamp_min(0).sum(-1).double() * visited
 
