@@ -402,8 +402,8 @@ MUTANTS = (
         "adjoint",
         "gradient rotated forwards, not back",
         f"{SOURCE}/children.cpp",
-        "v = product(v, conjugate(deformed_rotation(deformation)));",
-        "v = product(v, deformed_rotation(deformation));",
+        "v_quat = product(v_quat, conjugate(deformed_rotation(deformation)));",
+        "v_quat = product(v_quat, deformed_rotation(deformation));",
         SCENE,
     ),
     Mutant(
