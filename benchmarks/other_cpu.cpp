@@ -113,21 +113,23 @@ void networks() {
 
 template <class R>
 void children() {
-    constexpr int64_t anchors = 60, slots = 10, drawn = anchors * slots;
+    constexpr int64_t anchors = 60, slots = 10, drawn = anchors * slots, times = 2;
     Numbers from;
     const auto position = from.many<R>(3 * anchors, -1, 1), log_scale = from.many<R>(3 * anchors, -4, -2), offset = from.many<R>(3 * drawn, -1, 1);
     std::vector<int64_t> numbers(drawn);
     for (int64_t i = 0; i < drawn; i++) numbers[size_t(i)] = i;
-    std::vector<R> row(size_t(drawn * (3 + slots))), centre(3 * drawn), base(3 * drawn), mean(3 * drawn), quat(4 * drawn), size(3 * drawn);
+    std::vector<R> row(size_t(drawn * (3 + slots))), centre(3 * drawn), base(3 * drawn), mean(3 * drawn * times), quat(4 * drawn * times), size(3 * drawn * times),
+        shift(3 * drawn * times);
     graings::gather<R>({anchors, slots, position.data(), log_scale.data(), offset.data()}, drawn, numbers.data(), row.data(), centre.data(), base.data(), 2);
-    const auto canonical = from.many<R>(7 * drawn, -0.5, 0.5), deformation = from.many<R>(10 * drawn, -0.5, 0.5);
-    const graings::NetworkOutputs<R> outputs{drawn, canonical.data(), base.data(), centre.data(), deformation.data(), 1.5, {0.3, -8, 0, true}};
-    graings::compose<R>(outputs, mean.data(), quat.data(), size.data(), 2);
-    write("centre", centre), write("mean", mean), write("quat", quat), write("log_scale", size);
+    const auto canonical = from.many<R>(7 * drawn, -0.5, 0.5), deformation = from.many<R>(10 * drawn * times, -0.5, 0.5);
+    const graings::NetworkOutputs<R> outputs{drawn, times, canonical.data(), base.data(), centre.data(), deformation.data(), 1.5, {0.3, -8, 0, true}};
+    graings::compose<R>(outputs, mean.data(), quat.data(), size.data(), shift.data(), 2);
+    write("centre", centre), write("mean", mean), write("quat", quat), write("log_scale", size), write("shift", shift);
     const auto v_mean = from.many<R>(3 * drawn, -1, 1), v_quat = from.many<R>(4 * drawn, -1, 1), v_size = from.many<R>(3 * drawn, -1, 1);
-    std::vector<R> v_canonical(7 * drawn), v_deformation(10 * drawn), v_log_scale(3 * anchors), v_offset(3 * drawn);
-    graings::compose_gradient<R>(outputs, v_mean.data(), v_quat.data(), v_size.data(), v_canonical.data(), v_deformation.data(), 2);
-    graings::gather_gradient<R>({anchors, slots, position.data(), log_scale.data(), offset.data()}, drawn, numbers.data(), row.data(), v_mean.data(), v_size.data(), v_log_scale.data(), v_offset.data(), 2);
+    std::vector<R> v_canonical(7 * drawn), v_base(3 * drawn), v_centre(3 * drawn), v_deformation(10 * drawn * times), v_log_scale(3 * anchors), v_offset(3 * drawn);
+    const graings::GeometryGradients<R> upstream{{v_mean.data(), nullptr}, {v_quat.data(), v_quat.data()}, {v_size.data(), nullptr}, {nullptr, v_mean.data()}};
+    graings::compose_gradient<R>(outputs, upstream, v_canonical.data(), v_base.data(), v_centre.data(), v_deformation.data(), 2);
+    graings::gather_gradient<R>({anchors, slots, position.data(), log_scale.data(), offset.data()}, drawn, numbers.data(), row.data(), v_centre.data(), v_base.data(), v_log_scale.data(), v_offset.data(), 2);
     write("v_canonical", v_canonical), write("v_deformation", v_deformation), write("v_log_scale", v_log_scale), write("v_offset", v_offset);
 }
 

@@ -45,14 +45,14 @@ def test_gradcheck_of_reflected_passes() -> None:
 
 def test_colour_depends_on_the_normal_only_where_reflection_is_on() -> None:
     features = torch.randn(5, 8, generator=torch.Generator().manual_seed(7))
-    directions, children = _units(5, 8).float(), torch.arange(5 * 3)
+    directions = _units(5, 8).float()
     with_reflection = CanonicalAppearance(SceneConfig(children=3, feature_dim=8, reflection=True), 0.1)
     without = CanonicalAppearance(SceneConfig(children=3, feature_dim=8, reflection=False), 0.1)
     assert without.normal is None
     assert with_reflection.normal is not None
 
     def colors() -> Tensor:
-        return with_reflection.colors(with_reflection.color_part(features), directions, children)
+        return with_reflection.colors(with_reflection.color_part(features), directions)
 
     before = colors()
     with torch.no_grad():
