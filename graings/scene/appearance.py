@@ -60,7 +60,7 @@ class CanonicalAppearance(nn.Module):
             last.bias.fill_(math.atanh(initial_opacity))
 
     def color_part(self, features: Float[Tensor, "anchor feature"]) -> ColorPart:
-        """What `colors` needs of the features, for any number of views."""
+        """What `color_logits` needs of the features, for any number of views."""
         first = self.color[0]
         assert isinstance(first, nn.Linear)
         hidden = perceptron(features, [first.weight[:, : features.shape[-1]]], [first.bias])
@@ -73,8 +73,8 @@ class CanonicalAppearance(nn.Module):
         directions = encodings * direction_width(self.color_sh_degree)
         return [weights[0][:, -directions:], weights[1]], [torch.zeros_like(biases[0]), biases[1]]
 
-    def colors(self, part: ColorPart, directions: Float[Tensor, "anchor 3"]) -> Float[Tensor, "slot 3"]:
-        """c_can (Eq. 11) of every child slot before its sigmoid."""
+    def color_logits(self, part: ColorPart, directions: Float[Tensor, "anchor 3"]) -> Float[Tensor, "slot 3"]:
+        """F_c of Eq. 11 before the sigmoid, for every child slot."""
         inputs = direction_encoding(directions, self.color_sh_degree, part.normals)
         return perceptron(inputs, *self.color_layers(part), shared=part.hidden).view(-1, 3)
 

@@ -63,7 +63,7 @@ def plain_gather(scaffold: Scaffold, children: Int64[Tensor, " gaussian"]) -> Ch
 Geometry = tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"], Float[Tensor, "gaussian 3"]]
 
 
-class Posed(NamedTuple):
+class ChildGeometry(NamedTuple):
     """N children at one time."""
 
     means: Float[Tensor, "gaussian 3"]
@@ -79,7 +79,7 @@ def compose(
     extent: float,
     *,
     projected_clip: bool,
-) -> list[Posed]:
+) -> list[ChildGeometry]:
     """The rendered children at each time, Eq. 10; at one time without a `deformation`.
 
     `canonical` is the output of StaticMLP: quaternion minus the identity, log-scale minus the anchor's. `deformation`
@@ -91,8 +91,8 @@ def compose(
     outputs: tuple[Tensor, ...] = _Compose.apply(*inputs, extent, projected_clip, kernel.thread_count())  # type: ignore[no-untyped-call]
     if deformation is None:
         means, quats, log_scales = outputs
-        return [Posed(means, quats, log_scales, None)]
-    return [Posed(*outputs[first : first + 4]) for first in range(0, len(outputs), 4)]
+        return [ChildGeometry(means, quats, log_scales, None)]
+    return [ChildGeometry(*outputs[first : first + 4]) for first in range(0, len(outputs), 4)]
 
 
 def plain_compose(
@@ -102,20 +102,20 @@ def plain_compose(
     extent: float,
     *,
     projected_clip: bool,
-) -> list[Posed]:
+) -> list[ChildGeometry]:
     """The oracle of `compose`."""
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=canonical.dtype)
     quats = functional.normalize(canonical[:, :4] + identity, dim=-1, eps=1e-12)
     log_scales = children.anchor_log_scales + canonical[:, 4:]
     if deformation is None:
         log_scales = clip(log_scales, *LOG_SCALE_RANGE, projected=projected_clip)
-        return [Posed(children.canonical_means, quats, log_scales, None)]
+        return [ChildGeometry(children.canonical_means, quats, log_scales, None)]
     result = []
     for offsets in deformation.unbind(1):
         position_offsets = offsets[:, :3] * extent
         change = clip(offsets[:, 7:], -MAX_LOG_SCALE_OFFSET, MAX_LOG_SCALE_OFFSET, projected=projected_clip)
         result.append(
-            Posed(
+            ChildGeometry(
                 children.canonical_means + position_offsets,
                 quaternion_product(quats, offsets[:, 3:7] + identity),
                 clip(log_scales + change, *LOG_SCALE_RANGE, projected=projected_clip),
@@ -168,7 +168,7 @@ class _Gather(torch.autograd.Function):
 
 
 class _Compose(torch.autograd.Function):
-    """Outputs are those of `Posed`, time after time."""
+    """Outputs are those of `ChildGeometry`, time after time."""
 
     @staticmethod
     def forward(

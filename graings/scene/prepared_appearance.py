@@ -179,7 +179,7 @@ class PreparedAppearance:
     ) -> Float[Tensor, "gaussian 3"]:
         """Colours of `children` (ascending slots of these anchors) seen from `eye` [3] at the time of `changes`.
 
-        Equal to the bit to `CanonicalAppearance.colors`, the bounded residual and the clip of `Scene.compose`. With a
+        Equal to the bit to those of `Scene.compose`. With a
         `frustum`, those whose `geometry` is outside it may be 0. Raises `ValueError` for children out of order.
         """
         network: tuple[Any, ...] = (0, None, [], [])

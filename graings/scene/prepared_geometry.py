@@ -88,8 +88,8 @@ class _Evaluated(PreparedGeometry):
 
 
 def _evaluated(scene: Scene, slots: Tensor, time: float) -> Geometry:
-    (posed,), _ = scene.posed(scene.gathered(slots), slots, [time])
-    return posed.means, posed.quats, posed.log_scales
+    (geometry,), _ = scene.child_geometry(scene.gathered(slots), slots, [time])
+    return geometry.means, geometry.quats, geometry.log_scales
 
 
 class _Factorized(PreparedGeometry):
@@ -144,8 +144,8 @@ class BasisGeometry(PreparedGeometry):
 
 def unmoved(canonical: Float[Tensor, "child 7"], children: Children) -> Float[Tensor, "child 10"]:
     """Mean, unit quaternion and log-scale, not yet clipped, of children without an offset in time."""
-    (posed,) = compose(canonical, children, None, 1.0, projected_clip=False)
-    return torch.cat([posed.means, posed.quats, children.anchor_log_scales + canonical[:, 4:]], dim=1)
+    (geometry,) = compose(canonical, children, None, 1.0, projected_clip=False)
+    return torch.cat([geometry.means, geometry.quats, children.anchor_log_scales + canonical[:, 4:]], dim=1)
 
 
 def move(

@@ -25,7 +25,7 @@ from graings.scene.activations import tanh
 from graings.scene.appearance import CanonicalAppearance, ResidualField
 from graings.scene.canonical import INITIAL_SCALE, StaticMLP, default_geometry
 from graings.scene.child_colors import child_colors
-from graings.scene.children import Children, Posed, compose, gather
+from graings.scene.children import ChildGeometry, Children, compose, gather
 from graings.scene.deformation import Deformation, DeformationNetwork, SingleMLP
 from graings.scene.encoding import directions_from
 from graings.scene.scaffold import Scaffold
@@ -155,11 +155,11 @@ class Scene(nn.Module):
         children = self.gathered(slot_indices)
         uids = scaffold.child_uids(slot_indices)
         compositions = []
-        posed, deformation = self.posed(children, slot_indices, times)
-        per_view = zip(canonical_opacities, opacities, residuals, directions, posed, strict=True)
+        geometries, deformation = self.child_geometry(children, slot_indices, times)
+        per_view = zip(canonical_opacities, opacities, residuals, directions, geometries, strict=True)
         for canonical_opacity, opacity, residual, direction, geometry in per_view:
             shown = child_colors(
-                self.appearance.colors(color_part, direction),
+                self.appearance.color_logits(color_part, direction),
                 None if residual is None else residual.flatten(0, 1),
                 rendered,
                 config.residual_scale,
@@ -225,9 +225,9 @@ class Scene(nn.Module):
             outputs = self._predicted_deformation(children, canonical_means, [time])
         return Deformation(outputs, float(self.extent))
 
-    def posed(
+    def child_geometry(
         self, children: Children, slot_indices: Tensor, times: Sequence[float]
-    ) -> tuple[list[Posed], Deformation | None]:
+    ) -> tuple[list[ChildGeometry], Deformation | None]:
         """The rendered children at each time, and their offsets; None while the scene is static."""
         means, extent = children.canonical_means, float(self.extent)
         moves = self.temporal and (self.deformation is not None or self.single is not None)
@@ -247,7 +247,7 @@ class Scene(nn.Module):
         outputs = self._predicted_deformation(slot_indices, means, times)
         return self._composed(canonical, children, outputs), Deformation(outputs, extent)
 
-    def _composed(self, canonical: Tensor, children: Children, deformation: Tensor | None) -> list[Posed]:
+    def _composed(self, canonical: Tensor, children: Children, deformation: Tensor | None) -> list[ChildGeometry]:
         extent, projected = float(self.extent), self.config.projected_clip
         return compose(canonical, children, deformation, extent, projected_clip=projected)
 

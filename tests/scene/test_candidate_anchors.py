@@ -43,7 +43,9 @@ def all_slots(scene: Scene) -> tuple[Tensor, Tensor]:
     """Scores [A, k] and colours [A k, 3] of every slot, rendered or not."""
     scaffold = scene.scaffold
     scores = canonical_opacities(scene)
-    colors = scene.appearance.colors(scene.appearance.color_part(scaffold.features), scene.directions(EYE)).sigmoid()
+    colors = scene.appearance.color_logits(
+        scene.appearance.color_part(scaffold.features), scene.directions(EYE)
+    ).sigmoid()
     if scene.residual is not None:
         time = torch.tensor([TIME], dtype=torch.float64)
         residual = ETA * torch.tanh(scene.residual(scene.residual.part(scaffold.features), time, scene.directions(EYE)))

@@ -14,8 +14,8 @@ from graings import kernel
 from graings.scene.children import (
     LOG_SCALE_RANGE,
     MAX_LOG_SCALE_OFFSET,
+    ChildGeometry,
     Children,
-    Posed,
     compose,
     gather,
     plain_compose,
@@ -70,7 +70,9 @@ def gathered(function: Callable[..., Children], given: Scaffold, children: Tenso
     return [*(v.detach() for v in values), given.log_scales.grad, given.offsets.grad]  # type: ignore[list-item]
 
 
-def composed(function: Callable[..., list[Posed]], given: NetworkOutputs, *, projected: bool = True) -> list[Tensor]:
+def composed(
+    function: Callable[..., list[ChildGeometry]], given: NetworkOutputs, *, projected: bool = True
+) -> list[Tensor]:
     canonical, children, deformation = given
     inputs = (canonical, children.anchor_log_scales, children.canonical_means)
     leaves = [t.clone().requires_grad_() for t in inputs]
@@ -78,8 +80,8 @@ def composed(function: Callable[..., list[Posed]], given: NetworkOutputs, *, pro
         leaves.append(deformation.clone().requires_grad_())
     copies = Children(children.anchors, children.inputs, leaves[2], leaves[1])
     offsets = leaves[3] if deformation is not None else None
-    posed = function(leaves[0], copies, offsets, 1.7, projected_clip=projected)
-    values = [value for one in posed for value in one if value is not None]
+    geometry = function(leaves[0], copies, offsets, 1.7, projected_clip=projected)
+    values = [value for one in geometry for value in one if value is not None]
     random = torch.Generator().manual_seed(4)
     upstream = [torch.randn(v.shape, generator=random, dtype=torch.float64).to(v.dtype) for v in values]
     return [*(v.detach() for v in values), *torch.autograd.grad(values, leaves, upstream)]
@@ -116,22 +118,22 @@ def test_compose_equals_plain_torch(moves: bool, projected: bool, dtype: torch.d
 
 
 def test_log_scales_stay_within_their_bounds() -> None:
-    for posed in compose(*network_outputs(50, torch.float32, moves=True), 1.0, projected_clip=True):
-        assert posed.log_scales.min() >= LOG_SCALE_RANGE[0]
-        assert posed.log_scales.max() <= LOG_SCALE_RANGE[1]
+    for geometry in compose(*network_outputs(50, torch.float32, moves=True), 1.0, projected_clip=True):
+        assert geometry.log_scales.min() >= LOG_SCALE_RANGE[0]
+        assert geometry.log_scales.max() <= LOG_SCALE_RANGE[1]
     child = Children(torch.zeros(1, dtype=torch.int64), torch.zeros(1, 1), torch.zeros(1, 3), torch.zeros(1, 3))
     deformation = torch.tensor([[[0.0] * 7 + [3.0, 0.5, -9.0]]])
-    (posed,) = compose(torch.zeros(1, 7), child, deformation, 1.0, projected_clip=True)
-    assert torch.equal(posed.log_scales, torch.tensor([[MAX_LOG_SCALE_OFFSET, 0.5, -MAX_LOG_SCALE_OFFSET]]))
+    (geometry,) = compose(torch.zeros(1, 7), child, deformation, 1.0, projected_clip=True)
+    assert torch.equal(geometry.log_scales, torch.tensor([[MAX_LOG_SCALE_OFFSET, 0.5, -MAX_LOG_SCALE_OFFSET]]))
 
 
 def test_a_nan_is_not_hidden_by_a_clip() -> None:
     canonical, children, deformation = network_outputs(5, torch.float32, moves=True)
     canonical[3] = torch.nan
-    for posed in compose(canonical, children, deformation, 1.0, projected_clip=True):
-        assert posed.quats[3].isnan().all()
-        assert posed.log_scales[3].isnan().all()
-        assert posed.means.isfinite().all()
+    for geometry in compose(canonical, children, deformation, 1.0, projected_clip=True):
+        assert geometry.quats[3].isnan().all()
+        assert geometry.log_scales[3].isnan().all()
+        assert geometry.means.isfinite().all()
 
 
 @pytest.mark.parametrize("used", range(4))
@@ -153,9 +155,9 @@ def test_times_composed_together_are_those_composed_alone() -> None:
     canonical, children, deformation = network_outputs(500, torch.float32, moves=True)
     assert deformation is not None
     together = compose(canonical, children, deformation, 1.3, projected_clip=True)
-    for time, posed in enumerate(together):
+    for time, geometry in enumerate(together):
         (alone,) = compose(canonical, children, deformation[:, time : time + 1], 1.3, projected_clip=True)
-        assert all(torch.equal(a, b) for a, b in zip(posed, alone, strict=True))
+        assert all(torch.equal(a, b) for a, b in zip(geometry, alone, strict=True))
 
 
 def test_gradcheck_passes() -> None:
@@ -171,8 +173,8 @@ def test_gradcheck_passes() -> None:
             delattr(holder, name)
             setattr(holder, name, value)
         gathered_children = gather(holder, children)
-        posed = compose(values[2], gathered_children, values[3], 1.3, projected_clip=False)
-        return (*(value for one in posed for value in one), gathered_children.inputs)
+        geometry = compose(values[2], gathered_children, values[3], 1.3, projected_clip=False)
+        return (*(value for one in geometry for value in one), gathered_children.inputs)
 
     leaves = [t.detach().clone().requires_grad_() for t in (given.log_scales, given.offsets, canonical, deformation)]
     assert torch.autograd.gradcheck(through, leaves)

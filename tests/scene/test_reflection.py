@@ -52,7 +52,7 @@ def test_colour_depends_on_the_normal_only_where_reflection_is_on() -> None:
     assert with_reflection.normal is not None
 
     def colors() -> Tensor:
-        return with_reflection.colors(with_reflection.color_part(features), directions)
+        return with_reflection.color_logits(with_reflection.color_part(features), directions)
 
     before = colors()
     with torch.no_grad():
