@@ -206,6 +206,16 @@ def test_no_children_give_no_values_and_zero_gradients() -> None:
     assert all(not v.any() for v in values[3:])
 
 
+@pytest.mark.parametrize("times", [1, 3])
+def test_no_children_are_composed_to_none_at_each_time(times: int) -> None:
+    none = Children(torch.zeros(0, dtype=torch.int64), *(torch.zeros(0, width) for width in (4, 3, 3)))
+    leaves = (torch.zeros(0, 7, requires_grad=True), torch.zeros(0, times, 10, requires_grad=True))
+    geometry = compose(leaves[0], none, leaves[1], 1.0, projected_clip=True)
+    assert [len(value) for one in geometry for value in one] == [0] * (4 * times)
+    total = sum(value.sum() for one in geometry for value in one)
+    assert [len(gradient) for gradient in torch.autograd.grad(total, leaves)] == [0, 0]
+
+
 def test_canonical_means_are_anchor_plus_scale_times_offset() -> None:
     given, children = scaffold(20), torch.tensor([0, 4, 59])
     for row, child in zip(gather(given, children).canonical_means, children.tolist(), strict=True):

@@ -181,6 +181,15 @@ def test_deform_gives_the_deformation_of_the_composition() -> None:
     assert torch.equal(again.position_offsets(0), composition.position_offsets)
 
 
+def test_views_that_render_nothing_compose_no_gaussians() -> None:
+    scene = tiny_scene()
+    with torch.no_grad():
+        scene.appearance.opacity[-1].bias.fill_(-20.0)
+    for composition in scene.compose_together([(EYE, 0.1), (EYE, 0.6)]):
+        assert len(composition.gaussians) == 0
+        assert composition.deformation.outputs.shape == (0, 2, 10)
+
+
 @pytest.mark.parametrize(
     "options", [{}, {"deformation": "anchor"}, {"time_conditioning": "concatenated"}, {"single_mlp": True}]
 )
